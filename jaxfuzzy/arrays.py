@@ -1,0 +1,60 @@
+"""Array aliases with axis names, and the immutable record that every result is.
+
+Axis letters mean one thing everywhere: N points, K clusters, C varieties, D space, Q embedding coordinates,
+E embeddings, M candidates for the number of clusters.
+"""
+
+import dataclasses
+from typing import Any, TypeVar, dataclass_transform
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+__all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Scalar", "as_float", "is_concrete", "record", "static"]
+
+Scalar = float | Float[Array, ""]
+
+T = TypeVar("T")
+
+
+def static(**kwargs: Any) -> Any:
+    """A record field that fixes a shape or a name and is therefore part of the compilation key."""
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+def _short_repr(self: Any) -> str:
+    return eqx.tree_pformat(self, short_arrays=True)
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field, static))
+def record(cls: type[T]) -> type[T]:
+    """Makes a class an immutable dataclass that JAX treats as a pytree; fields made by `static` are not traced."""
+    cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+    if "__repr__" not in vars(cls):
+        cls.__repr__ = _short_repr  # type: ignore[method-assign, assignment]
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    return jax.tree_util.register_dataclass(
+        cls,
+        data_fields=[f.name for f in fields if not f.metadata.get("static")],
+        meta_fields=[f.name for f in fields if f.metadata.get("static")],
+    )
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether a value is known now, so that it may be looked at (False while JAX traces it)."""
+    return not isinstance(value, jax.core.Tracer)
+
+
+def as_float(value: Any) -> Array:
+    """A JAX array of the default float type, or of the value's own float type where it has one that JAX keeps.
+
+    Integers, booleans and float16 become the default float type; float64 stays float64 only where `jax_enable_x64` is set.
+    """
+    if not isinstance(value, jax.Array):
+        value = np.asarray(value)
+    if not jnp.issubdtype(value.dtype, jnp.floating) or jnp.finfo(value.dtype).bits < 32:
+        return jnp.asarray(value, jnp.result_type(float))
+    return jnp.asarray(value)
