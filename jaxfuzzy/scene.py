@@ -1,8 +1,9 @@
 """The pipeline: stereo pair -> cloud -> upright frame -> objects -> shapes. Read this module first."""
 
-from jaxfuzzy.arrays import Array, Float, Int, record
+from jaxfuzzy.arrays import Array, Float, Int, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.primitives import Plane
+from jaxfuzzy.rig import Rig
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
@@ -20,6 +21,9 @@ class Scene:
         timings: Seconds a stage.
         settings: What the scene was modelled with.
         status: Reasons to read this with care; see `describe`.
+        image: The left photograph the points were seen in, rectified, red green blue, uint8; None for a bare cloud.
+        image_right: The right one.
+        rig: The rectified cameras, in whose left image `cloud.pixels_px` counts.
     """
 
     cloud: Cloud
@@ -30,3 +34,6 @@ class Scene:
     timings: dict[str, float]
     settings: dict[str, object]
     status: Int[Array, ""]
+    image: Array | None = None
+    image_right: Array | None = None
+    rig: Rig | None = static(default=None)
