@@ -1,0 +1,137 @@
+"""From disparity or depth to a metric point cloud, with a standard deviation for every point.
+
+Depth is z = f B / (d + doffs) (`Rig` says what these are), x = (u - cx) z / fx, y = (v - cy) z / fy, in the left
+camera's frame. The standard deviation of z follows from that of the disparity, σ_z = z² σ_d / (f B).
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy import checks
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.rig import Rig
+from jaxfuzzy.status import Status
+
+# Real deviation of semi-global matching against ground truth on the Middlebury sets is 0.19-0.37 px at 370-560 rows;
+# the left-right residual and local differences understate it two to nine times.
+DISPARITY_STD_PX = 0.3
+
+
+def cloud_from_disparity(
+    disparity_px: Any, valid: Any, rig: Rig, *, image: Any = None, disparity_std_px: Any = DISPARITY_STD_PX
+) -> Cloud:
+    """Turns a disparity map into points in metres in the left camera's frame (x right, y down, z forward).
+
+    Args:
+        disparity_px: Disparities (H, W) of the left image in whole pixels and fractions of them. OpenCV's matchers give
+            16 times that as int16, which is refused here: divide by 16.0 first.
+        valid: Which pixels to use (H, W), or None for every finite disparity above 0. Pixels whose disparity is not
+            finite, or puts them at infinity or behind the camera (disparity + doffs not above 0), are left out.
+        rig: The rig of the image.
+        image: The left image for colors, grey (H, W) or BGR (H, W, 3), uint8.
+        disparity_std_px: Standard deviation of the disparity, one number or a map (H, W).
+
+    Returns:
+        The points in row order of their pixels, with colors, `depth_std` and `pixels_px`.
+
+    Raises:
+        ValueError: Shapes disagree, disparities are integers, or no pixel is left.
+    """
+    disparity = np.asarray(disparity_px)
+    if disparity.dtype == np.int16:
+        raise ValueError(
+            "disparity_px must be in pixels, got int16, which is OpenCV's fixed point: divide by 16.0 and mask what is"
+            " below the smallest disparity"
+        )
+    disparity = _map(disparity, "disparity_px", rig)
+    valid = np.isfinite(disparity) & (disparity > 0) if valid is None else _mask(valid, disparity.shape)
+    with np.errstate(invalid="ignore"):
+        valid = valid & np.isfinite(disparity) & (disparity + rig.doffs_px > 0)
+    scale = rig.focal_px[0] * rig.baseline_m
+    depth = np.full_like(disparity, np.nan)
+    depth[valid] = scale / (disparity[valid] + np.asarray(rig.doffs_px, disparity.dtype))
+    return _cloud(depth, valid, rig, image, _std(disparity_std_px, disparity) * depth**2 / scale)
+
+
+def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, depth_std: Any = None) -> Cloud:
+    """Turns a depth map of any other source (a depth camera, a learned matcher) into points in metres.
+
+    Args:
+        depth_m: Depth along the optical axis (H, W), metres; NaN, infinity, 0 and negative values mean unknown.
+        valid: Which pixels to use (H, W), or None for all that are known.
+        rig: The rig of the image; of a single camera only focal lengths and center matter.
+        image: The image for colors, grey (H, W) or BGR (H, W, 3), uint8.
+        depth_std: Standard deviation of the depth, one number or a map (H, W); None takes the rig's stereo error.
+
+    Returns:
+        The points in row order of their pixels, with colors, `depth_std` and `pixels_px`.
+
+    Raises:
+        ValueError: Shapes disagree or no pixel is left.
+    """
+    depth = _map(np.asarray(depth_m), "depth_m", rig)
+    known = np.isfinite(depth) & (depth > 0)
+    valid = known if valid is None else _mask(valid, depth.shape) & known
+    if depth_std is None:
+        std = DISPARITY_STD_PX * depth**2 / (rig.focal_px[0] * rig.baseline_m)
+    else:
+        std = np.broadcast_to(_std(depth_std, depth, "depth_std"), depth.shape)
+    return _cloud(depth, valid, rig, image, std)
+
+
+def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.ndarray) -> Cloud:
+    rows, columns = np.nonzero(valid)
+    if not len(rows):
+        raise ValueError("no pixel is left: none is valid, finite and in front of the camera")
+    z = depth[rows, columns]
+    x = (columns - rig.center_px[0]) / rig.focal_px[0] * z
+    y = (rows - rig.center_px[1]) / rig.focal_px[1] * z
+    dtype = depth.dtype
+    return Cloud(
+        points=jnp.asarray(np.stack([x, y, z], axis=1), dtype),
+        colors=None if image is None else _colors(image, rows, columns, depth.shape),
+        depth_std=jnp.asarray(std[rows, columns], dtype),
+        pixels_px=jnp.asarray(np.stack([columns, rows], axis=1), dtype),
+        status=0 if rig.metric else int(Status.ARBITRARY_UNITS),
+    )
+
+
+def _colors(image: Any, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> Array:
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.shape not in (shape, (*shape, 3)):
+        raise ValueError(f"image must be uint8 of shape {shape} or {(*shape, 3)}, got {image.dtype} {image.shape}")
+    colors = image[rows, columns]
+    colors = np.repeat(colors[:, None], 3, axis=1) if colors.ndim == 1 else colors[:, ::-1]
+    return jnp.asarray(colors.astype(np.float32) / 255)
+
+
+def _map(value: np.ndarray, name: str, rig: Rig) -> np.ndarray:
+    if value.ndim != 2 or value.dtype.kind not in "fiu":
+        raise ValueError(f"{name} must be real numbers of shape (H, W), got {value.dtype} {value.shape}")
+    if rig.image_size is not None and value.shape != rig.image_size[::-1]:
+        raise ValueError(
+            f"{name} must have the rig's size, {rig.image_size[1]} rows and {rig.image_size[0]} columns, got"
+            f" {value.shape[0]} and {value.shape[1]}; rig.scaled((width, height)) makes the rig of a resized image"
+        )
+    if not rig.rectified:
+        raise ValueError("rig must be rectified, since disparities are those of rectified images: see rectify")
+    return value.astype(np.float64 if value.dtype == np.float64 else np.float32)
+
+
+def _mask(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    mask = np.asarray(value)
+    if mask.shape != shape or mask.dtype not in (np.bool_, np.uint8):
+        raise ValueError(f"valid must be booleans of shape {shape}, got {mask.dtype} {mask.shape}")
+    return mask.astype(bool)
+
+
+def _std(value: Any, like: np.ndarray, name: str = "disparity_std_px") -> np.ndarray:
+    std = np.asarray(value, like.dtype)
+    if std.shape == ():
+        checks.number(value, name, above=0.0)
+    elif std.shape != like.shape:
+        raise ValueError(f"{name} must be one number or of shape {like.shape}, got {std.shape}")
+    return std
