@@ -126,7 +126,9 @@ def _finite(array: Array, name: str) -> Array:
         bad = ~np.isfinite(np.asarray(array))
         if bad.any():
             rows = np.flatnonzero(bad.reshape(len(array), -1).any(axis=1)) if array.ndim else np.array([0])
-            raise ValueError(f"{name} must be finite, got {len(rows)} non-finite rows, the first at index {int(rows[0])}")
+            raise ValueError(
+                f"{name} must be finite, got {len(rows)} non-finite rows, the first at index {int(rows[0])}"
+            )
     return array
 
 

@@ -138,5 +138,3 @@ def log_strengths(log_sizes: Float[Array, " K"] | None, mask: Bool[Array, " K"] 
     if mask is None:
         return log_sizes + jnp.log(jnp.asarray(log_sizes.shape[0], log_sizes.dtype))
     return jnp.where(mask, log_sizes + jnp.log(mask.sum().astype(log_sizes.dtype)), -jnp.inf)
-
-

@@ -121,7 +121,15 @@ def fixed_point(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3, 4, 5))
 def _solve(
-    step: Any, smooth: Any, jacobian: Any, max_steps: int, accelerate: bool, descent: bool, start: Array, tol: Array, args: Any
+    step: Any,
+    smooth: Any,
+    jacobian: Any,
+    max_steps: int,
+    accelerate: bool,
+    descent: bool,
+    start: Array,
+    tol: Array,
+    args: Any,
 ) -> tuple[Array, Array, Array, Array]:
     del smooth, jacobian
     eps = jnp.finfo(start.dtype).eps
@@ -158,7 +166,9 @@ def _solve_jvp(
 
     def of_moving(parts: list[Array]) -> Array:
         rest = iter(parts)
-        return smooth(y, treedef.unflatten([next(rest) if on else leaf for on, leaf in zip(moving, leaves, strict=True)]))[0]
+        return smooth(
+            y, treedef.unflatten([next(rest) if on else leaf for on, leaf in zip(moving, leaves, strict=True)])
+        )[0]
 
     primal = [leaf for on, leaf in zip(moving, leaves, strict=True) if on]
     tangent = [t for on, t in zip(moving, jax.tree.leaves(tangents[2]), strict=True) if on]
@@ -235,7 +245,9 @@ class _Alternation(optx.AbstractFixedPointSolver):
         state = _State(ahead, self.norm(ahead - new), state.moves, state.turns, state.known)
         return new, state, jnp.where(better, merit[1], merit[0])
 
-    def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, optx.RESULTS]:
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
+    ) -> tuple[Array, optx.RESULTS]:
         del fn, y, args, options, tags
         return state.change <= self.limit, optx.RESULTS.successful
 

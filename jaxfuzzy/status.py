@@ -35,6 +35,7 @@ class Status(enum.IntFlag):
     FEW_MATCHES = 1 << 20
     REFUSED = 1 << 21
     LOW_MARGIN = 1 << 22
+    UNSTABLE = 1 << 23
 
 
 SENTENCES: dict[Status, str] = {
@@ -63,6 +64,7 @@ SENTENCES: dict[Status, str] = {
     Status.FEW_MATCHES: "Few pixels were matched: check the disparity range, texture and that the images are not swapped.",
     Status.REFUSED: "None of the known kinds fits: named 'quadric' or 'unknown' rather than guessed.",
     Status.LOW_MARGIN: "The best kind is barely better than the next: look at the scores.",
+    Status.UNSTABLE: "Two centers coincide only because their seeds did and would part if nudged: start from other seeds.",
 }
 
 
