@@ -45,19 +45,19 @@ def body_of(kind: str, rng: np.random.Generator, size: float, lid: str) -> Body:
     """A body of about the given radius, other proportions random."""
     if kind == "box":
         half = size * np.array([1.0, rng.uniform(0.8, 1.6), rng.uniform(0.5, 1.0)])
-        return _box(half)
+        return box(half)
     if kind == "plane":
         return _plane(size * np.array([1.0, rng.uniform(0.6, 1.0)]), rng.uniform(-0.7, 0.7))
     if kind == "sphere":
-        return _ellipsoid("sphere", np.full(3, size))
+        return ellipsoid("sphere", np.full(3, size))
     if kind == "cylinder":
-        return _frustum("cylinder", size, size, size * rng.uniform(1.2, 4.0), lid)
+        return frustum("cylinder", size, size, size * rng.uniform(1.2, 4.0), lid)
     if kind == "cone":
         height, cut = size * rng.uniform(1.3, 3.0), rng.uniform(0.0, 0.5)
         ends = (size, cut * size) if rng.uniform() < 0.7 else (cut * size, size)
-        return _frustum("cone", *ends, height, lid)
+        return frustum("cone", *ends, height, lid)
     if kind == "ellipsoid":
-        return _ellipsoid("ellipsoid", size * rng.permutation([rng.uniform(0.5, 0.65), rng.uniform(0.8, 1.0), 1.5]))
+        return ellipsoid("ellipsoid", size * rng.permutation([rng.uniform(0.5, 0.65), rng.uniform(0.8, 1.0), 1.5]))
     implicit = {"torus": _torus, "saddle": _saddle, "blob": _blob}[kind]
     return implicit(size, rng)
 
@@ -71,7 +71,7 @@ def _roots(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return np.where(inside >= 0, both, np.inf)
 
 
-def _frustum(made: str, low: float, high: float, height: float, lid: str) -> Body:
+def frustum(made: str, low: float, high: float, height: float, lid: str) -> Body:
     """Surface of revolution about y with a straight side: radius `low` at y = 0, `high` at y = height."""
     slope = (high - low) / height
 
@@ -119,7 +119,7 @@ def _frustum(made: str, low: float, high: float, height: float, lid: str) -> Bod
     return Body(made, cast, np.hypot(widest, height / 2), height, widest, describe)
 
 
-def _box(half: np.ndarray) -> Body:
+def box(half: np.ndarray) -> Body:
     height = 2 * half[1]
 
     def cast(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +160,7 @@ def _plane(half: np.ndarray, pitch: float) -> Body:
     return Body("plane", cast, float(np.linalg.norm(half)), 2 * half[1], half[0], describe)
 
 
-def _ellipsoid(made: str, half: np.ndarray) -> Body:
+def ellipsoid(made: str, half: np.ndarray) -> Body:
     middle = np.array([0.0, half[1], 0.0])
 
     def cast(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
