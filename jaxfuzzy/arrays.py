@@ -5,16 +5,19 @@ E embeddings, M candidates for the number of clusters.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jax.typing import ArrayLike as JaxArrayLike
+from jaxtyping import Array, Bool, Float, Int
 
 __all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Scalar", "as_float", "is_concrete", "record", "static"]
 
+ArrayLike = JaxArrayLike | Sequence[Any]
 Scalar = float | Float[Array, ""]
 
 T = TypeVar("T")
@@ -34,7 +37,7 @@ def record(cls: type[T]) -> type[T]:
     """Makes a class an immutable dataclass that JAX treats as a pytree; fields made by `static` are not traced."""
     cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
     if "__repr__" not in vars(cls):
-        cls.__repr__ = _short_repr  # type: ignore[method-assign, assignment]
+        cls.__repr__ = _short_repr  # type: ignore[method-assign]
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     return jax.tree_util.register_dataclass(
         cls,

@@ -270,7 +270,9 @@ def _sweep(theta: Theta, args: Args, *, square: bool, exact: bool) -> Sums:
     lowest = jnp.asarray(-1e4, dtype)
     zero = jnp.zeros((), dtype)
 
-    def add(sums: tuple[Array, ...], x: Array, w: Array) -> tuple[Array, ...]:
+    def add(
+        sums: tuple[Array, Array, Array, Array, Array], x: Array, w: Array
+    ) -> tuple[Array, Array, Array, Array, Array]:
         mass, moment, scatter, objective, shift = sums
         apart = distances(x, centers)
         if square:
@@ -352,7 +354,7 @@ def _jacobian(theta: Theta, args: Args, *, sizes: bool) -> Float[Array, "p p"]:
     r = 1 / (m - 1)
     shift = _sweep(theta, args, square=False, exact=True).shift
 
-    def add(sums: tuple[Array, ...], x: Array, w: Array) -> tuple[Array, ...]:
+    def add(sums: tuple[Array, Array, Array, Array], x: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         crossed, own, mass, scatter = sums
         offset = x[None] - centers[:, :, None]
         apart = jnp.square(offset).sum(axis=1)
@@ -423,7 +425,9 @@ def _memberships_of(
     theta = {"centers": (partition.centers - tiles.mean) / tiles.scale}
     if partition.sizes_learned:
         theta["log_sizes"] = jnp.log(partition.sizes)
-    u, noise = _memberships(tiles, theta, partition.m, jnp.square(partition.noise_distance / tiles.scale), None)
+    u, noise = _memberships(
+        tiles, theta, jnp.asarray(partition.m), jnp.square(partition.noise_distance / tiles.scale), None
+    )
     return u[: tiles.count], noise[: tiles.count]
 
 
@@ -511,4 +515,4 @@ def jacobian(points: Float[Array, "N D"], partition: Partition, weights: Float[A
     if partition.sizes_learned:
         theta["log_sizes"] = jnp.log(partition.sizes)
     squared_noise = jnp.square(partition.noise_distance / tiles.scale)
-    return _jacobian(theta, (tiles, partition.m, squared_noise, None), sizes=partition.sizes_learned)
+    return _jacobian(theta, (tiles, jnp.asarray(partition.m), squared_noise, None), sizes=partition.sizes_learned)

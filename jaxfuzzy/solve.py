@@ -137,7 +137,7 @@ def _solve(
     limit = jnp.where(tol > 0, jnp.maximum(tol, 16 * eps), -1.0)
     solution = optx.fixed_point(
         step,
-        _Alternation(limit, accelerate, descent),
+        _Alternation(0.0, limit, _largest, accelerate, descent),  # type: ignore[arg-type]
         start,
         args,
         has_aux=True,
@@ -146,7 +146,7 @@ def _solve(
     )
     change, y = solution.state.change, solution.state.ahead
     converged = jnp.where(tol > 0, change <= limit, change <= 16 * eps) & jnp.isfinite(y).all()
-    return y, solution.stats["num_steps"], change, converged
+    return y, solution.stats["num_steps"].astype(jnp.int32), change, converged
 
 
 def _solve_jvp(
@@ -162,13 +162,12 @@ def _solve_jvp(
     start, tol, args = primals
     y, steps, change, converged = _solve(step, smooth, jacobian, max_steps, accelerate, descent, start, tol, args)
     leaves, treedef = jax.tree.flatten(args)
+    together = partial(jax.tree.unflatten, treedef)
     moving = [not isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents[2])]
 
     def of_moving(parts: list[Array]) -> Array:
         rest = iter(parts)
-        return smooth(
-            y, treedef.unflatten([next(rest) if on else leaf for on, leaf in zip(moving, leaves, strict=True)])
-        )[0]
+        return smooth(y, together([next(rest) if on else leaf for on, leaf in zip(moving, leaves, strict=True)]))[0]
 
     primal = [leaf for on, leaf in zip(moving, leaves, strict=True) if on]
     tangent = [t for on, t in zip(moving, jax.tree.leaves(tangents[2]), strict=True) if on]
@@ -207,17 +206,11 @@ class _State(eqx.Module):
 class _Alternation(optx.AbstractFixedPointSolver):
     """Alternating optimisation, each step either plain or Anderson's combination of the last ones, whichever is better."""
 
-    limit: Float[Array, ""]
+    rtol: float
+    atol: float  # the largest change that counts as standing still
+    norm: Callable[[Any], Array] = eqx.field(static=True)
     accelerate: bool = eqx.field(static=True)
     descent: bool = eqx.field(static=True)
-
-    # optimistix asks for these; the limit above is what stops the loop.
-    rtol: float = 0.0
-    atol: float = 0.0
-
-    @staticmethod
-    def norm(y: Any) -> Array:
-        return jnp.abs(y).max()
 
     def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
         del options, f_struct, aux_struct, tags
@@ -245,17 +238,19 @@ class _Alternation(optx.AbstractFixedPointSolver):
         state = _State(ahead, self.norm(ahead - new), state.moves, state.turns, state.known)
         return new, state, jnp.where(better, merit[1], merit[0])
 
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
-    ) -> tuple[Array, optx.RESULTS]:
+    def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, Any]:
         del fn, y, args, options, tags
-        return state.change <= self.limit, optx.RESULTS.successful
+        return state.change <= self.atol, optx.RESULTS.successful
 
     def postprocess(
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: optx.RESULTS
     ) -> tuple[Any, Any, dict[str, Any]]:
         del fn, args, options, state, tags, result
         return y, aux, {}
+
+
+def _largest(change: Array) -> Array:
+    return jnp.abs(change).max()
 
 
 def _remember(state: _State, move: Array, turn: Array) -> _State:
