@@ -1,0 +1,242 @@
+"""One round of alternating optimisation for fuzzy c-means, its derivative at a fixed point, and what can go wrong there.
+
+Paper symbols → words: v centers, alpha sizes, u memberships; S_i, the sum of w u_i^m D_i, is a cluster's scatter. Prototypes are
+a dictionary of centers and, where sizes are learned, their logarithms, in units where the points' RMS spread is 1.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxfuzzy.arrays import Array, Float, Int, record
+from jaxfuzzy.memberships import log_strengths, shares
+from jaxfuzzy.status import Status
+from jaxfuzzy.tiles import Tiles, expanded_distances, squared_distances, sum_tiles
+
+# Two centers nearer to each other than this share of their own points' RMS distance count as one.
+SAME_PLACE = 1e-2
+
+# What a step reads besides the prototypes: tiles, fuzzifier, squared noise distance, which clusters are real.
+Args = tuple[Tiles, Array, Array | None, Array | None]
+Theta = dict[str, Array]
+
+
+@record
+class Sums:
+    """What one sweep over all points adds up; the first three are relative to exp(shift), which cancels in every ratio.
+
+    Attributes:
+        mass: Sum of w u^m.
+        moment: Sum of w u^m x.
+        scatter: Sum of w u^m D.
+        log_objective: Logarithm of the reduced objective.
+        shift: The largest log u^m, or 0 where it was not needed.
+    """
+
+    mass: Float[Array, " K"]
+    moment: Float[Array, "K D"]
+    scatter: Float[Array, " K"]
+    log_objective: Float[Array, ""]
+    shift: Float[Array, ""]
+
+
+def log_sizes_of(theta: Theta, mask: Array | None) -> Float[Array, " K"]:
+    """Logarithm of the sizes; -inf for pads."""
+    clusters, dtype = theta["centers"].shape[0], theta["centers"].dtype
+    real = jnp.ones(clusters, bool) if mask is None else mask
+    equal = jnp.broadcast_to(-jnp.log(real.sum().astype(dtype)), (clusters,))
+    return jnp.where(real, theta.get("log_sizes", equal), -jnp.inf)
+
+
+def strengths_of(theta: Theta, mask: Array | None) -> Float[Array, " K"] | None:
+    """log(K alpha) as the membership rule takes it; None for equal sizes without pads."""
+    strengths = log_strengths(theta.get("log_sizes"), mask)
+    return None if strengths is None else strengths.astype(theta["centers"].dtype)
+
+
+def sweep(theta: Theta, args: Args, *, square: bool, exact: bool) -> Sums:
+    """One pass over the points. `square` is the short cut for m = 2, `exact` takes distances by differences."""
+    tiles, m, squared_noise, mask = args
+    centers, strengths = theta["centers"], strengths_of(theta, mask)
+    distances = squared_distances if exact else expanded_distances
+    clusters, dims = centers.shape
+    dtype = centers.dtype
+    lowest = jnp.asarray(-1e4, dtype)
+    zero = jnp.zeros((), dtype)
+
+    def add(
+        sums: tuple[Array, Array, Array, Array, Array], x: Array, w: Array
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        mass, moment, scatter, objective, shift = sums
+        apart = distances(x, centers)
+        if square:
+            power, term = _square_powers(apart, strengths, squared_noise)
+            new_shift, rescale = zero, jnp.ones((), dtype)
+        else:
+            part = shares(apart, m, strengths, squared_noise)
+            logs = part.log_powers(m)
+            new_shift = jax.lax.stop_gradient(jnp.maximum(shift, jnp.maximum(logs.max(), lowest)))
+            rescale = jnp.exp(shift - new_shift)
+            power, term = jnp.exp(logs - new_shift), part.objective(m, new_shift)
+        power = power * w
+        return (
+            mass * rescale + power.sum(axis=1),
+            moment * rescale + jnp.matmul(power, x.T, precision=jax.lax.Precision.HIGHEST),
+            scatter * rescale + (power * apart).sum(axis=1),
+            objective * rescale + term @ w,
+            new_shift,
+        )
+
+    start = (
+        jnp.zeros(clusters, dtype),
+        jnp.zeros((clusters, dims), dtype),
+        jnp.zeros(clusters, dtype),
+        zero,
+        zero if square else 2 * lowest,
+    )
+    mass, moment, scatter, objective, shift = sum_tiles(tiles, add, start)
+    return Sums(mass, moment, scatter, jnp.log(objective) + shift, shift)
+
+
+def _square_powers(
+    apart: Float[Array, "K n"], strengths: Float[Array, " K"] | None, squared_noise: Array | None
+) -> tuple[Float[Array, "K n"], Float[Array, " n"]]:
+    """Squared memberships and objective terms for m = 2, where no logarithm is needed."""
+    # Distances are relative to a spread of 1, so the square of rounding stands for zero without overflow.
+    floor = jnp.square(jnp.finfo(apart.dtype).eps)
+    closeness = 1 / jnp.maximum(apart, floor)
+    if strengths is not None:
+        closeness = closeness * jnp.exp(strengths)[:, None]
+    total = closeness.sum(axis=0)
+    if squared_noise is not None:
+        total = total + 1 / squared_noise
+    return jnp.square(closeness / total), 1 / total
+
+
+def step(theta: Theta, args: Args, *, sizes: bool, square: bool, exact: bool) -> tuple[Theta, Array]:
+    """One round of alternating optimisation (eqs. 9, 10, 11) and the objective where it started from."""
+    _, m, _, mask = args
+    sums = sweep(theta, args, square=square, exact=exact)
+    filled = sums.mass > 0
+    mass = jnp.where(filled, sums.mass, 1)
+    centers = jnp.where(filled[:, None], sums.moment / mass[:, None], theta["centers"])
+    if not sizes:
+        return {"centers": centers}, sums.log_objective
+    # Eq. 11 with the distances from the new centers: moving to the mean lowers each scatter by mass times move squared.
+    moved = jnp.square(centers - theta["centers"]).sum(axis=1)
+    rounding = jnp.finfo(centers.dtype).eps
+    scatter = jnp.maximum(sums.scatter - sums.mass * moved, jnp.square(rounding) * sums.mass)
+    log_root = jnp.log(jnp.where(filled, scatter, 1)) / m
+    log_root = jnp.where(filled, log_root, -jnp.inf)
+    if mask is not None:
+        log_root = jnp.where(mask, log_root, -jnp.inf)
+    logs = log_root - jax.nn.logsumexp(log_root)
+    # A dying size would fall for ever; at rounding it counts as dead and the status says so.
+    return {"centers": centers, "log_sizes": jnp.maximum(logs, jnp.log(rounding))}, sums.log_objective
+
+
+def step_jacobian(theta: Theta, args: Args, *, sizes: bool) -> Float[Array, "p p"]:
+    """Derivative of `step` at a fixed point in one sweep.
+
+    With psi_i = (x - v_i, D_i) and phi_j = d log(part_j) / d(v_j, log alpha_j) = (2 r (x - v_j) / D_j, 1), memberships change
+    by d(u_i^m) = m u_i^m (delta_ij - u_j) phi_j, so all sums are one matrix product of (K (D + 1), n) with its like.
+    """
+    tiles, m, squared_noise, mask = args
+    centers, strengths = theta["centers"], strengths_of(theta, mask)
+    clusters, dims = centers.shape
+    rows = dims + 1 if sizes else dims
+    r = 1 / (m - 1)
+    shift = sweep(theta, args, square=False, exact=True).shift
+
+    def add(sums: tuple[Array, Array, Array, Array], x: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+        crossed, own, mass, scatter = sums
+        offset = x[None] - centers[:, :, None]
+        apart = jnp.square(offset).sum(axis=1)
+        part = shares(apart, m, strengths, squared_noise)
+        u, power = part.memberships, jnp.exp(part.log_powers(m) - shift) * w
+        off = apart > 0
+        phi = jnp.where(off[:, None], 2 * r * offset / jnp.where(off, apart, 1)[:, None], 0)
+        psi = offset
+        if sizes:
+            psi = jnp.concatenate([psi, apart[:, None]], axis=1)
+            phi = jnp.concatenate([phi, jnp.ones_like(apart)[:, None]], axis=1)
+        left = (power[:, None] * psi).reshape(clusters * rows, -1)
+        right = (u[:, None] * phi).reshape(clusters * rows, -1)
+        return (
+            crossed + left @ right.T,
+            own + jnp.einsum("kan,kbn->kab", power[:, None] * psi, phi),
+            mass + power.sum(axis=1),
+            scatter + (power * apart).sum(axis=1),
+        )
+
+    start = (
+        jnp.zeros((clusters * rows, clusters * rows), centers.dtype),
+        jnp.zeros((clusters, rows, rows), centers.dtype),
+        jnp.zeros(clusters, centers.dtype),
+        jnp.zeros(clusters, centers.dtype),
+    )
+    crossed, own, mass, scatter = sum_tiles(tiles, add, start)
+    change = -crossed.reshape(clusters, rows, clusters, rows)
+    change = m * change.at[jnp.arange(clusters), :, jnp.arange(clusters)].add(own)
+    per_mass = jnp.where(mass > 0, 1 / jnp.where(mass > 0, mass, 1), 0)
+    to_centers = change[:, :dims] * per_mass[:, None, None, None]
+    flat = clusters * dims
+    if not sizes:
+        return to_centers.reshape(flat, flat)
+    per_scatter = jnp.where(scatter > 0, 1 / jnp.where(scatter > 0, scatter, 1), 0)
+    log_scatter = change[:, dims] * per_scatter[:, None, None] / m
+    alpha = jnp.exp(log_sizes_of(theta, mask))
+    alive = theta["log_sizes"] > jnp.log(jnp.finfo(centers.dtype).eps)
+    to_sizes = jnp.where(alive[:, None, None], log_scatter - jnp.einsum("i,ijb->jb", alpha, log_scatter), 0)
+
+    def by_name(block: Array) -> Array:
+        """From (rows, K, D + 1) to (rows, K D + K), the order in which the prototypes are raveled."""
+        block = block.reshape(-1, clusters, rows)
+        return jnp.concatenate([block[:, :, :dims].reshape(-1, flat), block[:, :, dims]], axis=1)
+
+    return jnp.concatenate([by_name(to_centers), by_name(to_sizes)])
+
+
+def diagnose(theta: Theta, args: Args, sums: Sums, converged: Array, *, sizes: bool) -> Int[Array, ""]:
+    """Every reason to mistrust a fit, found in one more sweep over the points."""
+    tiles, m, squared_noise, mask = jax.lax.stop_gradient(args)
+    theta, sums = jax.lax.stop_gradient((theta, sums))
+    centers, strengths = theta["centers"], strengths_of(theta, mask)
+    clusters, dims = centers.shape
+    real = jnp.ones(clusters, bool) if mask is None else mask
+
+    def add(total: Array, x: Array, w: Array) -> Array:
+        offset = x[None] - centers[:, :, None]
+        apart = jnp.square(offset).sum(axis=1)
+        part = shares(apart, m, strengths, squared_noise)
+        power = jnp.exp(part.log_powers(m) - sums.shift) * w
+        unit = power / jnp.where(apart > 0, apart, 1)
+        return total + jnp.einsum("kn,kan,kbn->kab", unit, offset, offset)
+
+    spread = sum_tiles(tiles, add, jnp.zeros((clusters, dims, dims), centers.dtype))
+    mass = jnp.where(sums.mass > 0, sums.mass, 1)
+    elongation = jnp.linalg.eigvalsh(spread / mass[:, None, None])[:, -1]
+    own = sums.scatter / mass
+    apart = jnp.square(centers[:, None] - centers[None]).sum(axis=-1)
+    close = apart <= SAME_PLACE**2 * jnp.maximum(jnp.minimum(own[:, None], own[None]), jnp.finfo(own.dtype).eps ** 2)
+    twins = close & real[:, None] & real[None] & ~jnp.eye(clusters, dtype=bool)
+    # Merged centers are stable where no direction holds more than (m - 1) / 2m of the unit scatter; elsewhere a nudge parts them.
+    stable = elongation <= (m - 1) / (2 * m) * (1 + 1e-3)
+    merged, parted = twins.any(axis=1) & stable, twins.any(axis=1) & ~stable
+    one_place = (twins | ~real[None] | ~real[:, None] | jnp.eye(clusters, dtype=bool)).all() & (real.sum() > 1)
+    finite = jnp.isfinite(centers).all() & jnp.isfinite(sums.log_objective) | (sums.log_objective == -jnp.inf)
+    bits = [
+        (Status.NOT_CONVERGED, ~converged),
+        (Status.NOT_FINITE, ~finite),
+        (Status.COLLAPSED, one_place & merged.any() & (tiles.spread > 0)),
+        (Status.MERGED, merged.any() & ~one_place),
+        (Status.UNSTABLE, parted.any() & (tiles.spread > 0)),
+        (Status.TOO_FEW_POINTS, (tiles.weights > 0).sum() < real.sum()),
+        (Status.DEGENERATE, tiles.spread <= 0),
+    ]
+    if sizes:
+        alpha = jnp.exp(log_sizes_of(theta, mask))
+        rounding = jnp.finfo(centers.dtype).eps
+        pointlike = real & (own <= 1e3 * rounding) & (sums.mass > 0) & (tiles.spread > 0)
+        dying = real & (alpha * real.sum() < 1e-3) & ~pointlike
+        bits += [(Status.SPIKE, pointlike.any() & (real.sum() > 1)), (Status.DYING, dying.any())]
+    return sum((jnp.where(condition, int(bit), 0) for bit, condition in bits), jnp.zeros((), jnp.int32))
