@@ -60,7 +60,7 @@ def test_mesh_is_closed_outward_and_of_the_right_volume(name):
     mesh = trimesh.Trimesh(np.asarray(vertices), np.asarray(faces), process=False)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
-    # 48 sides inscribed in a circle lose 0.29 % of its area, a sphere as much again along its rings; 40 cells lose 0.8 %
+    # 48 sides inscribed in a circle lose 0.29 % of its area, a sphere as much again along its rings; 40 cells 0.8 %
     assert mesh.volume == pytest.approx(volume(BODIES[name]), rel=1e-9 if "box" in name else 9e-3)
 
 
@@ -82,7 +82,7 @@ def test_distance_is_that_to_the_mesh(name):
     if name == "quadric":  # first order only: points within 2 % of its size
         points = trimesh.sample.sample_surface(mesh, 200, seed=3)[0] + RNG.uniform(-0.01, 0.01, (200, 3))
     _, expected, _ = trimesh.proximity.closest_point_naive(mesh, points)
-    # 100 sides leave a sagitta of 5e-4 of a radius, twice that on the sphere; the quadric's mesh and its first order 1e-3.
+    # 100 sides leave a sagitta of 5e-4 of a radius, twice that on the sphere; the quadric 1e-3.
     tolerance = {"plane": 1e-12, "quadric": 2e-3}.get(name, 1e-12 if "box" in name else 2.5e-4)
     np.testing.assert_allclose(body.distance(points), expected, atol=tolerance)
 
