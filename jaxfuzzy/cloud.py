@@ -1,6 +1,20 @@
-"""The point cloud: record, files, supporting plane and upright frame."""
+"""The point cloud: its record, and reading and writing it."""
 
-from jaxfuzzy.arrays import Array, Float, Int, record
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy import cloudfiles
+from jaxfuzzy.arrays import Array, Float, Int, as_float, record
+from jaxfuzzy.files import read_bytes, write_atomic
+
+SUFFIXES = (".ply", ".pcd", ".npy", ".npz", ".csv", ".xyz", ".txt")
+COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 @record
@@ -20,3 +34,123 @@ class Cloud:
     depth_std: Float[Array, " N"] | None = None
     pixels_px: Float[Array, "N 2"] | None = None
     status: Int[Array, ""] | int = 0
+
+
+def read_cloud(path: str | os.PathLike[str]) -> Cloud:
+    """Reads a point cloud: PLY, PCD, NPY, NPZ, CSV or XYZ, told apart by content. Nothing is unpickled.
+
+    Coordinates are taken as they are, in metres. Points that are not finite are left out, and a warning says how many.
+    What a file holds beside coordinates, colors and what `write_cloud` adds (normals, labels, ...) is passed over.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is in none of these formats, damaged, cut short, or holds no finite point.
+    """
+    try:
+        columns = cloudfiles.parse(read_bytes(path, "cloud"))
+        if missing := [name for name in "xyz" if name not in columns]:
+            raise ValueError(f"has no column {', '.join(missing)}, only {', '.join(columns)}")
+        points = np.stack([columns[name] for name in "xyz"], axis=1)
+        if points.dtype.kind != "f":
+            points = points.astype(float)
+        finite = np.isfinite(points).all(axis=1)
+        if not finite.any():
+            raise ValueError(f"holds no finite point, out of {len(points)}")
+    except ValueError as error:
+        raise ValueError(f"cloud {os.fspath(path)} {error}".replace("\n", " ")) from None
+    if not finite.all():
+        warnings.warn(
+            f"cloud {os.fspath(path)}: {int((~finite).sum())} of {len(points)} points are not finite and were left out",
+            stacklevel=2,
+        )
+
+    def kept(*names: str) -> Array | None:
+        if not all(name in columns for name in names):
+            return None
+        values = np.stack([columns[name][finite] for name in names], axis=1).astype(np.float32)
+        return as_float(values[:, 0] if len(names) == 1 else values)
+
+    return Cloud(
+        points=as_float(points[finite].astype(points.dtype.newbyteorder("="))),
+        colors=_colors(columns, finite),
+        depth_std=kept("depth_std"),
+        pixels_px=kept("column_px", "row_px"),
+    )
+
+
+def write_cloud(
+    path: str | os.PathLike[str], cloud: Cloud, *, extra: Mapping[str, Any] | None = None, ascii: bool = False
+) -> None:
+    """Writes a point cloud, whole or not at all, in the format its suffix names.
+
+    Args:
+        path: Ends in .ply, .pcd, .npz, .npy (points alone), .csv or .xyz/.txt (no names; points and colors).
+        cloud: The cloud.
+        extra: Further columns by name, one number a point.
+        ascii: Write PLY and PCD as text.
+
+    Raises:
+        ValueError: The suffix is none of these, a column has another length, or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {os.fspath(path)}")
+    points = np.asarray(cloud.points)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise ValueError(f"cloud.points must have shape (N, 3) with at least one point, got {points.shape}")
+    arrays = {"points": points}
+    columns: cloudfiles.Columns = dict(zip("xyz", points.T, strict=True))
+    if cloud.colors is not None:
+        arrays["colors"] = np.rint(np.clip(np.asarray(cloud.colors), 0, 1) * 255).astype(np.uint8)
+        columns |= dict(zip(COLORS[0], arrays["colors"].T, strict=True))
+    if cloud.depth_std is not None:
+        arrays["depth_std"] = columns["depth_std"] = np.asarray(cloud.depth_std)
+    if cloud.pixels_px is not None:
+        arrays["pixels_px"] = np.asarray(cloud.pixels_px)
+        columns |= dict(zip(("column_px", "row_px"), arrays["pixels_px"].T, strict=True))
+    for name, values in (extra or {}).items():
+        arrays[name] = columns[name] = np.asarray(values)
+    for name, values in columns.items():
+        columns[name] = _writable(name, values, len(points))
+    if suffix == ".ply":
+        data = cloudfiles.write_ply(columns, ascii=ascii)
+    elif suffix == ".pcd":
+        data = cloudfiles.write_pcd(columns, ascii=ascii)
+    elif suffix in (".npy", ".npz"):
+        data = cloudfiles.write_numpy(arrays, packed=suffix == ".npz")
+    elif suffix == ".csv":
+        data = cloudfiles.write_text(columns, delimiter=",", names=True)
+    else:
+        plain = {name: values for name, values in columns.items() if name in ("x", "y", "z", *COLORS[0])}
+        data = cloudfiles.write_text(plain, delimiter=" ", names=False)
+    write_atomic(path, data)
+
+
+def _writable(name: str, values: np.ndarray, count: int) -> np.ndarray:
+    """One number a point, of a type that the formats have."""
+    if values.shape != (count,) or values.dtype.kind not in "fiub":
+        raise ValueError(f"column {name} must hold {count} numbers, got {values.dtype} of shape {values.shape}")
+    if values.dtype == bool:
+        return values.astype(np.uint8)
+    if values.dtype.kind in "iu" and values.dtype.itemsize == 8:
+        return values.astype(np.int32)
+    return values.astype(np.float32) if values.dtype.itemsize == 2 and values.dtype.kind == "f" else values
+
+
+def _colors(columns: cloudfiles.Columns, kept: np.ndarray) -> Array | None:
+    packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
+    names = next((names for names in COLORS if all(name in columns for name in names)), None)
+    if names is not None:
+        colors = np.stack([columns[name][kept] for name in names], axis=1)
+    elif packed is not None and packed.dtype.itemsize == 4:
+        # PCL packs a color into the bits of a float or an unsigned number: 0x00RRGGBB.
+        bits = packed[kept].astype(packed.dtype.newbyteorder("=")).view(np.uint32)
+        colors = np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], axis=1).astype(np.uint8)
+    else:
+        return None
+    if colors.dtype.kind in "iu":
+        top = 65535.0 if colors.dtype.itemsize == 2 else 255.0
+    else:
+        colors = np.where(np.isfinite(colors), colors, 0)
+        top = 1.0 if colors.max(initial=0) <= 1 else 255.0
+    return jnp.asarray(np.clip(colors.astype(np.float32) / top, 0, 1))
