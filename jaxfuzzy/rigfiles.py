@@ -36,7 +36,7 @@ def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rect
     """
     if re.search(r"^\s*cam0\s*=", text, re.MULTILINE):
         return middlebury(text)
-    if re.search(r"^\s*P(0|2|_rect_00|_rect_02):", text, re.MULTILINE):
+    if re.search(r"^P(0|2|_rect_00|_rect_02):\s+[-+.\d]", text, re.MULTILINE):
         return kitti(text, cameras)
     tree = storage(text)
     other_tree = None if other is None else storage(other)
@@ -209,11 +209,13 @@ def _matrices(tree: Fields) -> Fields:
     out: Fields = {}
     for name, value in tree.items():
         if isinstance(value, dict):
-            if {"rows", "cols", "data"} <= value.keys():
+            # OpenCV 5 writes what has not two axes with "sizes" in place of rows and columns.
+            if "data" in value and ("sizes" in value or {"rows", "cols"} <= value.keys()):
                 data = np.ravel(np.asarray(value["data"], float))
-                shape = int(value["rows"]), int(value["cols"])
-                if data.size != shape[0] * shape[1]:
-                    raise ValueError(f"{name} says {shape[0]} x {shape[1]} but holds {data.size} numbers")
+                sizes = value["sizes"] if "sizes" in value else (value["rows"], value["cols"])
+                shape = tuple(int(size) for size in np.ravel(sizes))
+                if data.size != int(np.prod(shape)):
+                    raise ValueError(f"{name} says {' x '.join(map(str, shape))} but holds {data.size} numbers")
                 out[name] = data.reshape(shape)
             else:
                 out[name] = _matrices(value)
