@@ -1,0 +1,146 @@
+"""Ends of a surface: where the points on it stop, and from surface and ends to a bounded primitive in metres.
+
+Points are first moved along their rays onto the surface, which takes the depth noise out of every end. An end is where points
+become rare: the stretch that holds the most points over a price per length, a third of its own density, so that a few
+outliers beyond do not move it and it lands on the last point of the surface itself.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Sphere
+
+PRICE = 0.35
+
+
+class Frame(NamedTuple):
+    """From metres in the user's frame to an object's own: q = turn (p - origin) / unit."""
+
+    turn: Array
+    origin: Array
+    unit: Array
+
+
+def stretch(values: np.ndarray) -> tuple[float, float, float]:
+    """Low and high end of where values lie densely, and the standard error of an end; a wrong value here or there does no harm."""
+    x = np.sort(values)
+    low, high = 0, len(x) - 1
+    if high < 1:
+        return (float(x[0]), float(x[0]), 0.0) if len(x) else (0.0, 0.0, 0.0)
+    for _ in range(4):
+        density = PRICE * (high - low + 1) / max(x[high] - x[low], 1e-12)
+        gain = np.arange(len(x)) - density * x
+        # The best stretch ends at the largest gain over the smallest one before it.
+        before = np.minimum.accumulate(gain)
+        new_high = int(np.argmax(gain - before))
+        new_low = int(np.argmin(gain[: new_high + 1]))
+        if (new_low, new_high) == (low, high) or new_high <= new_low:
+            break
+        low, high = new_low, new_high
+    spacing = (x[high] - x[low]) / max(high - low, 1)
+    # The last of evenly spread points lies half a spacing to one spacing inside the true end.
+    return float(x[low] - spacing), float(x[high] + spacing), float(spacing)
+
+
+def ends_of(kind: str, theta: np.ndarray, hits: np.ndarray, part: np.ndarray, on: np.ndarray, signs: np.ndarray):
+    """Ends (low, high, error) (3, 3) of a surface in its own frame, unit free.
+
+    Args:
+        kind: The kind.
+        theta: Its parameters as in `rays`.
+        hits: Points moved onto it, in the frame in which its axis is y (N, 3).
+        part: The part of the surface each belongs to.
+        on: Which are inliers.
+        signs: Of the faces of a box.
+    """
+    ends = np.zeros((3, 3))
+    if kind in ("cylinder", "cone"):
+        ends[0] = stretch(hits[on, 1])
+        if kind == "cone" and theta[3] != 0:
+            tip = theta[2] / theta[3]
+            ends[0, :2] = np.minimum(ends[0, :2], tip) if theta[3] > 0 else np.maximum(ends[0, :2], tip)
+    elif kind == "box":
+        c, s = np.cos(theta[0]), np.sin(theta[0])
+        across = np.stack([c * hits[:, 0] + s * hits[:, 2], c * hits[:, 2] - s * hits[:, 0], hits[:, 1]])
+        for i in range(3):
+            ends[i] = stretch(across[i][on & (part != i)])
+            if signs[i]:
+                ends[i, 1 if signs[i] > 0 else 0] = theta[1 + i]
+    elif kind == "plane":
+        first, second = _patch_axes(theta[:3])
+        a, b = hits[on] @ first, hits[on] @ second
+        # The rectangle of least area, turned in its plane.
+        turns = np.deg2rad(np.arange(0, 90, 3.0))
+        u = np.cos(turns)[:, None] * a + np.sin(turns)[:, None] * b
+        v = np.cos(turns)[:, None] * b - np.sin(turns)[:, None] * a
+        area = np.prod([np.subtract(*np.percentile(w, [97, 3], axis=1)) for w in (u, v)], axis=0)
+        best = int(np.argmin(area))
+        ends[0], ends[1], ends[2, 0] = stretch(u[best]), stretch(v[best]), turns[best]
+    return ends
+
+
+def assembled(
+    kind: str, theta: Array, lean: Array, ends: Array, signs: Array, rotation: Array, frame: Frame
+) -> Primitive:
+    """The bounded primitive in metres, from a surface in its own frame, its ends and a small further lean of its axis."""
+    zero = jnp.zeros_like(lean[0])
+    cross = jnp.stack(
+        [jnp.stack([zero, -lean[1], zero]), jnp.stack([lean[1], zero, -lean[0]]), jnp.stack([zero, lean[0], zero])]
+    )
+    # Only the derivative by the lean is ever used, at zero.
+    turn = (jnp.eye(3, dtype=theta.dtype) + cross) @ rotation @ frame.turn
+    place = lambda q: frame.origin + frame.unit * (turn.T @ q)
+    low, high = ends[:, 0], ends[:, 1]
+    up = turn[1]
+    if kind == "sphere":
+        return Sphere(center=place(theta[:3]), radius=frame.unit * jnp.abs(theta[3]))
+    if kind == "cylinder":
+        base = place(jnp.stack([theta[0], low[0], theta[1]]))
+        return Cylinder(base=base, axis=up, radius=frame.unit * theta[2], height=frame.unit * (high[0] - low[0]))
+    if kind == "cone":
+        tip = theta[2] / theta[3]
+        sign = jnp.where(theta[3] > 0, -1.0, 1.0).astype(theta.dtype)
+        reach = jnp.sort(jnp.maximum(sign * (ends[0, :2] - tip), 0.0)) * frame.unit
+        apex = place(jnp.stack([theta[0], tip, theta[1]]))
+        return Cone(apex=apex, axis=sign * up, half_angle=jnp.arctan(jnp.abs(theta[3])), height=reach)
+    if kind == "box":
+        c, s = jnp.cos(theta[0]), jnp.sin(theta[0])
+        axes = jnp.stack([jnp.stack([c, zero, s]), jnp.stack([zero, zero + 1, zero]), jnp.stack([-s, zero, c])])
+        face = theta[1:]
+        low = jnp.where(signs < 0, face, low)[jnp.array([0, 2, 1])]
+        high = jnp.where(signs > 0, face, high)[jnp.array([0, 2, 1])]
+        return Box(
+            center=place(axes.T @ (0.5 * (low + high))),
+            size=frame.unit * (high - low),
+            axes=axes @ turn,
+            seen=jnp.ones(3, bool),
+        )
+    length = jnp.sqrt((theta[:3] ** 2).sum())
+    normal = theta[:3] / length
+    first, second = _patch_axes_jax(normal)
+    c, s = jnp.cos(ends[2, 0]), jnp.sin(ends[2, 0])
+    first, second = c * first + s * second, c * second - s * first
+    foot = normal * theta[3] / length
+    corner = lambda a, b: place(foot + a * first + b * second)
+    corners = jnp.stack(
+        [corner(low[0], low[1]), corner(high[0], low[1]), corner(high[0], high[1]), corner(low[0], high[1])]
+    )
+    return Plane(point=corners.mean(0), normal=turn.T @ normal, corners=corners)
+
+
+def _patch_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    first, second = _patch_axes_jax(jnp.asarray(normal / np.linalg.norm(normal)))
+    return np.asarray(first), np.asarray(second)
+
+
+def _patch_axes_jax(normal: Array) -> tuple[Array, Array]:
+    """Two directions in a plane: the level one, or where the plane is level itself, x; and the one across."""
+    level = jnp.stack([normal[2], jnp.zeros_like(normal[0]), -normal[0]])
+    flat = (level**2).sum() < 1e-4
+    level = jnp.where(flat, jnp.stack([normal[1], -normal[0], jnp.zeros_like(normal[0])]), level)
+    first = level / jnp.sqrt((level**2).sum())
+    return first, jnp.cross(normal, first)

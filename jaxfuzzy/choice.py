@@ -1,0 +1,110 @@
+"""Choice among candidate surfaces: likelihood of surface noise against background, price per parameter, guards.
+
+A candidate explains a point either by its noise (normal, with a scale of its own) or by a background that is uniform along the
+viewing ray. Share and scale follow from a few EM steps. The score is minus the likelihood plus half the logarithm of the number
+of points a parameter (Schwarz), in nats: lower is better.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.rays import Residual, View
+
+EM_STEPS = 4
+HALF_LOG_2PI = 0.9189385332046727
+
+
+class Mixture(NamedTuple):
+    """How H candidates explain N points.
+
+    Attributes:
+        log_likelihood: (H,), in nats.
+        background: Share of the points left to the background (H,).
+        scale: Noise scale in units of the points' own deviations (H,).
+        ownership: Probability that a point belongs to the surface (H, N), 0 for padding.
+    """
+
+    log_likelihood: Array
+    background: Array
+    scale: Array
+    ownership: Array
+
+
+def cost(residual: Residual, mask: Array, threshold: float) -> Array:
+    """Σ D / (D + c²), the objective of one fuzzy variety beside a noise cluster at distance c, for m = 2."""
+    square = (residual.error**2 + residual.miss**2) / threshold**2
+    total = (mask * (square / (1 + square))).sum(-1)
+    return jnp.where(jnp.isfinite(total), total, jnp.inf)
+
+
+def mixture(residual: Residual, view: View, depth_range: Array, scale_bounds: tuple[float, float]) -> Mixture:
+    """Likelihood of each candidate, its share and scale fitted by EM."""
+    square = residual.error**2 + residual.miss**2
+    # Both densities are per unit of depth in units of the point's own deviation.
+    outside = -jnp.log(depth_range * view.gain)
+    count = view.mask.sum() + 1e-9
+
+    def logs(background: Array, scale: Array) -> tuple[Array, Array]:
+        surface = -0.5 * square / (scale**2)[:, None] - jnp.log(scale)[:, None] - residual.log_std - HALF_LOG_2PI
+        return jnp.log1p(-background)[:, None] + surface, jnp.log(background)[:, None] + outside
+
+    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        surface, background = logs(*state)
+        own = jax.nn.sigmoid(surface - background) * view.mask
+        total = own.sum(-1)
+        scale = jnp.sqrt((own * square).sum(-1) / (total + 1e-9))
+        return jnp.clip(1 - total / count, 1e-3, 0.999), jnp.clip(scale, *scale_bounds)
+
+    ones = jnp.ones(square.shape[0], square.dtype)
+    share, scale = lax.fori_loop(0, EM_STEPS, step, (0.3 * ones, ones))
+    surface, background = logs(share, scale)
+    likelihood = (view.mask * jnp.logaddexp(surface, background)).sum(-1)
+    return Mixture(
+        log_likelihood=jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf),
+        background=share,
+        scale=scale,
+        ownership=jax.nn.sigmoid(surface - background) * view.mask,
+    )
+
+
+def cone_tapers(theta: Array, own: Array, height: Array) -> Array:
+    """A cone must narrow by a quarter over its inliers, and by more than 0.06 and less than 2.2 a unit of height."""
+    total = own.sum(-1) + 1e-9
+    mean = (own * height).sum(-1) / total
+    spread = 1.7 * jnp.sqrt(jnp.maximum((own * (height - mean[:, None]) ** 2).sum(-1) / total, 1e-12))
+    low, high = (theta[:, 2] - theta[:, 3] * (mean + side * spread) for side in (-1, 1))
+    ratio = jnp.minimum(low, high) / jnp.maximum(jnp.maximum(low, high), 1e-6)
+    slope = jnp.abs(theta[:, 3])
+    return (ratio < 0.75) & (slope > 0.06) & (slope < 2.2)
+
+
+def faces_hold(residual: Residual, signs: Array, mixed: Mixture, view: View) -> Array:
+    """Every face of a box must hold 3.5 % of its inliers, eight points, and most of the points within its own extent."""
+    picture = _picture(view)
+    kept = jnp.ones(signs.shape[0], bool)
+    inliers = mixed.ownership.sum(-1) + 1e-9
+    for face in range(3):
+        met = (residual.part == face) * view.mask
+        own = met * mixed.ownership
+        total = own.sum(-1) + 1e-9
+        within = met
+        for coordinate in picture:
+            mean = (own * coordinate).sum(-1) / total
+            spread = jnp.sqrt(jnp.maximum((own * (coordinate - mean[:, None]) ** 2).sum(-1) / total, 1e-10))
+            within = within * (jnp.abs(coordinate - mean[:, None]) < 1.7 * spread[:, None])
+        filled = (own * within).sum(-1) / (within.sum(-1) + 1e-9) / (1 - mixed.background)
+        held = (total >= 0.035 * inliers) & (total >= 8.0) & (filled >= 0.6)
+        kept = kept & (held | (signs[:, face] == 0))
+    return kept
+
+
+def _picture(view: View) -> tuple[Array, ...]:
+    """Coordinates in which a face's extent is judged: the picture's, or without a camera the place's."""
+    if view.ray is None:
+        return view.point
+    u, v, w = view.ray
+    return u / w, v / w
