@@ -12,6 +12,10 @@ import numpy as np
 from jaxfuzzy.arrays import Array, as_float, is_concrete
 
 
+class DataError(ValueError):
+    """The data themselves rule out a result, however they are asked for: too few matches, nothing left to fit."""
+
+
 def points(value: Any, name: str = "points", *, dims: int | None = None) -> Array:
     """Points as a float array (N, D): 2-D, real, at least one row, finite where known."""
     if value is None or isinstance(value, str | bytes):
@@ -39,6 +43,21 @@ def weights(value: Any, count: int, name: str = "weights") -> Array | None:
             raise ValueError(f"{name} must not be negative, got a smallest value of {float(array.min())}")
         if not np.any(np.asarray(array) > 0):
             raise ValueError(f"{name} must not all be zero")
+    return array
+
+
+def memberships(value: Any, count: int, name: str = "memberships") -> Array:
+    """Memberships as a float array (N, C): not negative, finite, no column all zero."""
+    array = points(value, name)
+    if array.shape[0] != count:
+        raise ValueError(f"{name} must have shape ({count}, C), one row a point, got {tuple(array.shape)}")
+    if is_concrete(array):
+        known = np.asarray(array)
+        if np.any(known < 0):
+            raise ValueError(f"{name} must not be negative, got a smallest value of {float(known.min())}")
+        if not np.all(known.max(axis=0) > 0):
+            empty = int(np.argmin(known.max(axis=0) > 0))
+            raise ValueError(f"{name} must leave no column all zero, got column {empty} so")
     return array
 
 
