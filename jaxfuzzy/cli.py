@@ -1,0 +1,267 @@
+"""The command line: stereo pairs, clouds, tables and calibration boards in; results on disk and a short table out.
+
+Results go to standard output, everything else to standard error. Exit status: 0 done, 1 the data could not be modelled,
+2 wrong use or unreadable input, 130 stopped by Ctrl-C. Heavy modules are imported on use, so that help comes at once.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxfuzzy.arguments import WRONG_USE, parser
+from jaxfuzzy.checks import DataError
+from jaxfuzzy.terminal import Progress, columns, say, show, warnings_as_lines
+
+if TYPE_CHECKING:
+    from jaxfuzzy.fcm import Partition
+    from jaxfuzzy.scene import Scene
+
+DONE, NOT_MODELLED, STOPPED = 0, 1, 130
+# What is left of a run once the scene is modelled: drawing and writing, roughly.
+WRITING = 0.2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        argv: The words after the program's name; by default those it was started with.
+
+    Returns:
+        The exit status.
+    """
+    try:
+        args = parser(
+            {"demo": _demo, "model": _model, "shapes": _shapes, "cluster": _cluster, "calibrate": _calibrate}
+        ).parse_args(argv)
+    except SystemExit as done:  # argparse has said why
+        return int(done.code or 0)
+    try:
+        with warnings_as_lines():
+            _set_up_process()
+            status: int = args.run(args)
+            sys.stdout.flush()
+            return status
+    except KeyboardInterrupt:
+        say("stopped; nothing was written")
+        return STOPPED
+    except BrokenPipeError:
+        # Whoever read our output has gone; Python would complain once more when it closes it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except DataError as error:
+        say(str(error))
+        return NOT_MODELLED
+    except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+        say(str(error))
+        return WRONG_USE
+    except MemoryError:
+        say("not enough memory for an input of this size")
+        return WRONG_USE
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from jaxfuzzy.stereo import example_pair
+
+    left, right, rig = example_pair()
+    return _scene(args, lambda **options: _modelling().model_scene(left, right, rig, **options))
+
+
+def _model(args: argparse.Namespace) -> int:
+    from jaxfuzzy.rig import load_rig
+
+    rig = load_rig(args.rig)
+    return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **options))
+
+
+def _shapes(args: argparse.Namespace) -> int:
+    from jaxfuzzy.cloud import read_cloud
+
+    cloud = read_cloud(args.cloud)
+    return _scene(args, lambda **options: _modelling().model_cloud(cloud, **options))
+
+
+def _scene(args: argparse.Namespace, model: Callable[..., "Scene"]) -> int:
+    """Models a scene, writes it, and prints what was found."""
+    from jaxfuzzy import report
+    from jaxfuzzy.status import describe
+
+    report.check_folder(args.out)
+    if not report.can_draw():
+        say("report.html and figures are left out: they need pip install 'jaxfuzzy[view]'", args.quiet)
+    names = ("ks", "noise_distance", "kinds", "up", "ground", "camera", "rule")
+    options = {name: getattr(args, name) for name in names if getattr(args, name, None) is not None}
+    if getattr(args, "no_ground", False):
+        options["ground"] = None
+    with Progress(args.quiet) as progress:
+        scene = model(progress=lambda stage, share: progress(stage, share * (1 - WRITING)), **options)
+        if not scene.shapes:
+            raise DataError(f"no object was found. {describe(scene.status)}")
+        progress("writing", 1 - WRITING)
+        files = report.save(scene, args.out)
+    tree = report.to_dict(scene)
+    if args.json:
+        show(json.dumps(tree | {"folder": os.fspath(args.out), "files": files}, allow_nan=False))
+        return DONE
+    for line in _scene_lines(scene, tree):
+        show(line)
+    shown = [name for name in files if not name.startswith("figures/")]
+    pictures = len(files) - len(shown)
+    say(f"wrote {args.out}/: {', '.join(shown)}{f', figures/ ({pictures})' if pictures else ''}", args.quiet)
+    return DONE
+
+
+def _cluster(args: argparse.Namespace) -> int:
+    from jaxfuzzy import table
+    from jaxfuzzy.fcm import fcm
+    from jaxfuzzy.seeding import histogram_seeds
+    from jaxfuzzy.status import describe
+    from jaxfuzzy.validity import choose_k
+
+    if args.out is not None:
+        table.check_suffix(args.out)
+        if args.out.exists() and args.out.samefile(args.points):
+            raise ValueError(f"out must not be the input, got {args.out}")
+    names, points = table.read_points(args.points, args.columns)
+    ks = args.ks
+    with Progress(args.quiet) as progress:
+        scores: dict[int, float] = {}
+        k = ks[0]
+        if len(ks) > 1:
+            progress("trying every k", 0.0)
+            chosen = choose_k(
+                points, ks, m=args.m, index=args.index, rule=args.rule, noise_distance=args.noise_distance
+            )
+            k = int(chosen.k)
+            scores = {int(one): float(score) for one, score in zip(chosen.ks, chosen.scores, strict=True)}
+        progress("fitting", 0.5 if scores else 0.0)
+        seeds = histogram_seeds(points, k).centers
+        partition = fcm(points, seeds, m=args.m, sizes=args.sizes, noise_distance=args.noise_distance)
+        if args.out is not None:
+            progress("writing", 0.9)
+            table.write_points(args.out, names, points, partition)
+    result = _cluster_result(names, k, args.index, scores, partition)
+    if args.json:
+        show(json.dumps(result, allow_nan=False))
+        return DONE
+    if scores:
+        show(f"{args.index}: " + ", ".join(f"k = {one} {score:.4g}" for one, score in scores.items()))
+    rows = [
+        [str(i), f"{size:.4f}", str(result["counts"][i]), *(f"{v:.6g}" for v in result["centers"][i])]
+        for i, size in enumerate(result["sizes"])
+    ]
+    for line in columns(["cluster", "size", "points", *names], rows):
+        show(line)
+    if result["noise_points"]:
+        show(f"noise: {result['noise_points']} points")
+    if result["status"]:
+        show(f"note: {describe(result['status'])}")
+    if args.out is not None:
+        say(f"wrote {args.out}", args.quiet)
+    return DONE
+
+
+def _cluster_result(
+    names: Sequence[str], k: int, index: str, scores: dict[int, float], partition: "Partition"
+) -> dict[str, Any]:
+    import numpy as np
+
+    from jaxfuzzy.status import SENTENCES
+
+    labels, status = np.asarray(partition.labels), int(partition.status)
+    return {
+        "schema": "jaxfuzzy/partition",
+        "version": 1,
+        "columns": list(names),
+        "k": k,
+        "index": index,
+        "scores": {str(one): score if np.isfinite(score) else None for one, score in scores.items()},
+        "centers": np.asarray(partition.centers, float).tolist(),
+        "sizes": np.asarray(partition.sizes, float).tolist(),
+        "counts": [int((labels == i).sum()) for i in range(k)],
+        "noise_points": int((labels < 0).sum()),
+        "objective": float(partition.objective),
+        "steps": int(partition.steps),
+        "status": status,
+        "reasons": [sentence for bit, sentence in SENTENCES.items() if bit & status],
+        "labels": labels.tolist(),
+    }
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    import dataclasses
+
+    from jaxfuzzy.calibrate import calibrate
+    from jaxfuzzy.rig import save_rig
+
+    if len(args.left) != len(args.right):
+        raise ValueError(f"left and right must be as many images, got {len(args.left)} and {len(args.right)}")
+    with Progress(args.quiet) as progress:
+        progress("looking for the board", 0.0)
+        rig = calibrate(args.left, args.right, board=args.board, square_m=args.square)
+        save_rig(args.out, rig)
+    if args.json:
+        show(json.dumps(dataclasses.asdict(rig), allow_nan=False))
+        return DONE
+    found = rig.calibration
+    show(f"focal length {rig.focal_px[0]:.2f} px, baseline {1e3 * rig.baseline_m:.2f} mm")
+    if found is not None:
+        show(f"reprojection error {found.rms_px:.3f} px over {len(found.pairs)} pairs (below 0.5 is good)")
+        for number, reason in found.left_out:
+            show(f"left out {args.left[number]}: {reason}")
+    say(f"wrote {args.out}", args.quiet)
+    return DONE
+
+
+def _scene_lines(scene: "Scene", tree: dict[str, Any]) -> Iterator[str]:
+    from jaxfuzzy import drawing
+
+    metric = tree["units"]["length"] == "m"
+    rows = [
+        [
+            drawing.name(index, shape),
+            drawing.size_text(shape, metric=metric) or "-",
+            str(entry["points"]),
+            f"{100 * entry['inliers'] / max(entry['points'], 1):.0f} %",
+        ]
+        for index, (shape, entry) in enumerate(zip(scene.shapes, tree["shapes"], strict=True))
+    ]
+    yield from columns(["object", "sizes", "points", "on surface"], rows, right=(2, 3))
+    for reason in tree["reasons"]:
+        yield f"note: {reason}"
+    by_reason: dict[str, list[str]] = {}
+    for entry in tree["shapes"]:
+        for reason in entry["reasons"]:
+            by_reason.setdefault(reason, []).append(str(entry["object"]))
+    for reason, objects in by_reason.items():
+        yield f"note on {', '.join(objects)}: {reason}"
+
+
+def _modelling() -> Any:
+    from jaxfuzzy import scene
+
+    return scene
+
+
+def _set_up_process() -> None:
+    """Keeps what JAX compiles in the user's cache folder, so that a second run need not compile."""
+    import jax
+
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return  # the user, or a test, has chosen
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfuzzy"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", os.fspath(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
