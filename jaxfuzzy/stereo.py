@@ -6,7 +6,6 @@ strip that the matcher cannot answer is regained by padding; both images are mat
 """
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,73 +13,23 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Bool, Float
+from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.files import read_bytes
-from jaxfuzzy.reproject import DISPARITY_STD_PX, cloud_from_disparity
+from jaxfuzzy.matcher import STEP, Matcher
+from jaxfuzzy.photos import Image, alignment, grey, read_pair, rectify
+from jaxfuzzy.reproject import cloud_from_disparity
 from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.status import Status
 
-Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
-
-METHODS = {"sgbm": cv2.StereoSGBM_MODE_SGBM_3WAY, "hh": cv2.StereoSGBM_MODE_HH, "bm": -1}
+MODES = {"sgbm": cv2.StereoSGBM_MODE_SGBM_3WAY, "hh": cv2.StereoSGBM_MODE_HH}
 FEWEST_POINTS = 50
 FEW_MATCHES_SHARE = 0.1
+MISALIGNED_PX = 0.75  # rows may differ by less without harm
 SIXTEENTHS = 16  # OpenCV's fixed point: disparities are int16, 16 a pixel
-STEP = 16  # OpenCV searches a multiple of 16 disparities
 COARSE_WIDTH = 320  # the disparity range is looked for on images no wider than this
 RANGE_SHARE = 0.002  # share of coarse matches left out at either end of the range
-
-
-@dataclasses.dataclass(frozen=True)
-class Matcher:
-    """How to match. The defaults are those that answered most and erred least on ten real scenes with ground truth.
-
-    Attributes:
-        method: "sgbm" (semi-global, three directions), "hh" (all directions: smoother fractions, several times slower)
-            or "bm" (block matching: only where there is texture).
-        min_disparity: Smallest disparity to search, whole pixels; None takes it from the scene.
-        disparities: How many disparities to search, a multiple of 16; None takes it from the scene.
-        block: Side of the matched block, odd. Larger ones fatten edges ("bm" uses at least 15).
-        smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block.
-        uniqueness: By how many per cent the best match must beat the second.
-        left_right_px: Largest difference between matching left to right and right to left; None leaves the check out.
-        speckle_px: Connected patches of at most so many pixels are removed; 0 keeps them.
-        edge_px: Pixels to erode from the nearer side of a depth edge, where matching bleeds over; 0 keeps them.
-        disparity_std_px: Standard deviation of a disparity, from which every point's `depth_std` comes.
-    """
-
-    method: str = "sgbm"
-    min_disparity: int | None = None
-    disparities: int | None = None
-    block: int = 3
-    smoothness: tuple[float, float] = (8.0, 32.0)
-    uniqueness: int = 10
-    left_right_px: float | None = 1.0
-    speckle_px: int = 100
-    edge_px: int = 1
-    disparity_std_px: float = DISPARITY_STD_PX
-
-    def __post_init__(self) -> None:
-        checks.choice(self.method, "method", METHODS.keys())
-        if self.min_disparity is not None:
-            checks.integer(self.min_disparity, "min_disparity", at_least=-4096, at_most=4096)
-        if self.disparities is not None:
-            checks.integer(self.disparities, "disparities", at_least=STEP, at_most=4096)
-            if self.disparities % STEP:
-                raise ValueError(f"disparities must be a multiple of {STEP}, got {self.disparities}")
-        checks.integer(self.block, "block", at_least=1, at_most=51)
-        if self.block % 2 == 0:
-            raise ValueError(f"block must be odd, got {self.block}")
-        if len(self.smoothness) != 2 or not 0 < self.smoothness[0] < self.smoothness[1]:
-            raise ValueError(f"smoothness must be two prices, 0 < first < second, got {self.smoothness}")
-        checks.integer(self.uniqueness, "uniqueness", at_least=0, at_most=100)
-        if self.left_right_px is not None:
-            checks.number(self.left_right_px, "left_right_px", above=0.0)
-        checks.integer(self.speckle_px, "speckle_px", at_least=0)
-        checks.integer(self.edge_px, "edge_px", at_least=0, at_most=20)
-        checks.number(self.disparity_std_px, "disparity_std_px", above=0.0)
+WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
 
 
 def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = None) -> Cloud:
@@ -97,22 +46,32 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
 
     Raises:
         FileNotFoundError: An image does not exist.
-        ValueError: An image cannot be used, sizes disagree, or fewer than 50 pixels were matched.
+        ValueError: An image cannot be used or sizes disagree.
+        DataError: Fewer than 50 pixels were matched, or left and right are swapped.
     """
     matcher = Matcher() if matcher is None else matcher
     left, right = read_pair(left, right, rig)
+    if not rig.rectified:
+        left, right, rig = rectify(left, right, rig)
+    found = alignment(left, right)
+    if found.swapped and matcher.min_disparity is None:
+        raise DataError(
+            "left and right seem to be swapped: things appear further right in the right image"
+            f" ({found.disparity_px[1]:.0f} px in the middle of {found.matches} matches); where that is right because the"
+            " cameras look inwards, give Matcher(min_disparity=...)"
+        )
     disparity_px, valid = disparity(left, right, rig, matcher=matcher)
     count = int(valid.sum())
     if count < FEWEST_POINTS:
-        raise ValueError(
-            f"only {count} of {valid.size} pixels were matched, {FEWEST_POINTS} are needed: check that left and right"
-            " are not swapped, that the images are rectified, the range of disparities, and that there is texture"
+        rows = f"rows differ by {found.rows_px:+.1f} px" if found.matches else "no common features were found"
+        raise DataError(
+            f"only {count} of {valid.size} pixels were matched, {FEWEST_POINTS} are needed: check that the images are"
+            f" rectified ({rows}), the range of disparities, and that there is texture"
         )
+    status = int(Status.MISALIGNED) * (abs(found.rows_px) > MISALIGNED_PX)
+    status |= int(Status.FEW_MATCHES) * (count < FEW_MATCHES_SHARE * valid.size)
     cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=matcher.disparity_std_px)
-    status = int(cloud.status)
-    if count < FEW_MATCHES_SHARE * valid.size:
-        status |= int(Status.FEW_MATCHES)
-    return dataclasses.replace(cloud, status=status)
+    return dataclasses.replace(cloud, status=int(cloud.status) | status)
 
 
 def disparity(
@@ -147,6 +106,8 @@ def disparity(
         valid &= ~_edges(values, valid, matcher.edge_px)
     if matcher.speckle_px:
         valid = _without_speckles(values, valid, matcher.speckle_px)
+    if matcher.refine and valid.any():
+        values = _refined(left, right, values, valid)
     return jnp.asarray(np.where(valid, values, np.float32(np.nan))), jnp.asarray(valid)
 
 
@@ -204,8 +165,7 @@ def _match(left: Image, right: Image, low: int, count: int, matcher: Matcher) ->
         bm = cv2.StereoBM.create(count, block)
         bm.setMinDisparity(low)
         bm.setUniquenessRatio(matcher.uniqueness)
-        padded = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in padded]
-        values = bm.compute(*padded)
+        values = bm.compute(grey(padded[0]), grey(padded[1]))
     else:
         area = matcher.block**2 * (1 if left.ndim == 2 else left.shape[2])
         first, second = (round(price * area) for price in matcher.smoothness)
@@ -218,7 +178,7 @@ def _match(left: Image, right: Image, low: int, count: int, matcher: Matcher) ->
             disp12MaxDiff=1,
             preFilterCap=31,
             uniquenessRatio=matcher.uniqueness,
-            mode=METHODS[matcher.method],
+            mode=MODES[matcher.method],
         )
         values = sgbm.compute(*padded)
     return values[:, before : before + left.shape[1]].astype(np.float32) / SIXTEENTHS
@@ -246,62 +206,34 @@ def _without_speckles(values: np.ndarray, valid: np.ndarray, area: int, jump: in
     return valid & (fixed != gone)
 
 
-def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
-    """Two images ready for matching: uint8, the same size and number of channels, the size of the rig.
+def _refined(left: Image, right: Image, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Disparities moved by one step of Lucas and Kanade (IJCAI 1981), between two edge-keeping means.
 
-    16-bit and floating-point images are scaled to 8 bits by the larger maximum of the two; a grey image beside a color
-    one makes both grey; an opaque alpha channel is dropped.
-
-    Raises:
-        FileNotFoundError: An image does not exist.
-        ValueError: An image cannot be used, or sizes disagree.
-        TypeError: An argument is neither a path nor an array.
+    The step minimises the squared difference of left and shifted right image, less its mean (brightness may differ), over
+    a Gaussian window. The means are bilateral: a neighbor counts less the further its disparity is.
     """
-    images = [_image(value, name) for value, name in ((left, "left"), (right, "right"))]
-    if images[0].shape[:2] != images[1].shape[:2]:
-        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]
-        raise ValueError(f"left and right must have the same size, got {sizes[0]} and {sizes[1]}")
-    height, width = images[0].shape[:2]
-    if rig.image_size is not None and (width, height) != rig.image_size:
-        raise ValueError(
-            f"images must have the size the rig is for, {rig.image_size[0]} x {rig.image_size[1]}, got {width} x"
-            f" {height}; rig.scaled(({width}, {height})) makes the rig of resized images"
-        )
-    if images[0].dtype != images[1].dtype:
-        raise ValueError(f"left and right must have the same type, got {images[0].dtype} and {images[1].dtype}")
-    if images[0].dtype != np.uint8:
-        top = max(float(image.max()) for image in images)
-        images = [(image * (255.0 / max(top, 1e-12)) + 0.5).astype(np.uint8) for image in images]
-    if images[0].ndim != images[1].ndim:
-        images = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]
-    return images[0], images[1]
+    left, right = (grey(image).astype(np.float32) for image in (left, right))
+    columns, rows = np.meshgrid(*(np.arange(size, dtype=np.float32) for size in left.shape[::-1]))
+    slope = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
+    here = valid.astype(np.float32)
 
+    def window(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values * here, (0, 0), WINDOW_PX) / share
 
-def _image(value: Any, name: str) -> np.ndarray:
-    if isinstance(value, str | os.PathLike):
-        data = np.frombuffer(read_bytes(value, f"{name} image"), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise ValueError(f"{name} is not an image that can be read: {os.fspath(value)}")
-    elif value is None:
-        raise TypeError(f"{name} must be an image or a path, got None")
-    else:
-        image = np.asarray(value)
-    if image.ndim == 3 and image.shape[2] == 1:
-        image = image[:, :, 0]
-    if image.ndim == 3 and image.shape[2] == 4:
-        opaque = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(image.dtype, 1.0)
-        if not np.all(image[:, :, 3] == opaque):
-            raise ValueError(f"{name} has transparent pixels, whose color is unknown: remove the alpha channel")
-        image = image[:, :, :3]
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
-        raise ValueError(f"{name} must be grey (H, W) or BGR (H, W, 3), got shape {image.shape}")
-    if image.dtype.kind == "f":
-        if not np.all(np.isfinite(image)) or image.min() < 0:
-            raise ValueError(f"{name} must be finite and not negative")
-    elif image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{name} must be uint8, uint16 or floating point, got {image.dtype}")
-    return image
+    def mean(values: np.ndarray) -> np.ndarray:
+        low = np.float32(values[valid].min() - 8)  # so far away that pixels without a disparity count for nothing
+        return cv2.bilateralFilter(np.where(valid, values, low), -1, 1.0, SMOOTHING_PX)
+
+    share = np.maximum(cv2.GaussianBlur(here, (0, 0), WINDOW_PX), 1e-6)
+    start = mean(values)
+    shifted = cv2.remap(right, columns - start, rows, cv2.INTER_LINEAR)
+    gradient = (cv2.filter2D(left, -1, slope) + cv2.remap(cv2.filter2D(right, -1, slope), columns - start, rows, 1)) / 2
+    difference = left - shifted
+    flat, plain = window(gradient), window(difference)
+    # Two squared grey levels in the divisor keep pixels without texture where they are.
+    step = (window(gradient * difference) - flat * plain) / (window(gradient**2) - flat**2 + 2)
+    moved = np.clip(start - step, values - LARGEST_STEP_PX, values + LARGEST_STEP_PX)
+    return np.where(valid, mean(np.where(valid, moved, values)), values)
 
 
 def example_pair() -> tuple[Path, Path, Rig]:

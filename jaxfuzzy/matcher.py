@@ -1,0 +1,64 @@
+"""How to match a stereo pair: the settings, which carry their own checks."""
+
+import dataclasses
+
+from jaxfuzzy import checks
+from jaxfuzzy.reproject import DISPARITY_STD_PX
+
+METHODS = ("sgbm", "hh", "bm")
+STEP = 16  # OpenCV searches a multiple of 16 disparities
+
+
+@dataclasses.dataclass(frozen=True)
+class Matcher:
+    """How to match. The defaults are those that answered most and erred least on ten real scenes with ground truth.
+
+    Attributes:
+        method: "sgbm" (semi-global, three directions), "hh" (all directions: smoother fractions, several times slower)
+            or "bm" (block matching: only where there is texture).
+        min_disparity: Smallest disparity to search, whole pixels; None takes it from the scene.
+        disparities: How many disparities to search, a multiple of 16; None takes it from the scene.
+        block: Side of the matched block, odd. Larger ones fatten edges ("bm" uses at least 15).
+        smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block.
+        uniqueness: By how many per cent the best match must beat the second.
+        left_right_px: Largest difference between matching left to right and right to left; None leaves the check out.
+        speckle_px: Connected patches of at most so many pixels are removed; 0 keeps them.
+        edge_px: Pixels to erode from the nearer side of a depth edge, where matching bleeds over; 0 keeps them.
+        refine: Refine the matcher's sixteenths of a pixel by the images' gradients; on the same ten scenes the deviation
+            from the truth falls by a quarter to a half.
+        disparity_std_px: Standard deviation of a disparity, from which every point's `depth_std` comes. The default is
+            the middle of 0.13 to 0.32 px measured on real scenes at 370 to 560 rows; unrefined it is 0.3, and at
+            1,500 rows twice that.
+    """
+
+    method: str = "sgbm"
+    min_disparity: int | None = None
+    disparities: int | None = None
+    block: int = 3
+    smoothness: tuple[float, float] = (8.0, 32.0)
+    uniqueness: int = 10
+    left_right_px: float | None = 1.0
+    speckle_px: int = 100
+    edge_px: int = 1
+    refine: bool = True
+    disparity_std_px: float = DISPARITY_STD_PX
+
+    def __post_init__(self) -> None:
+        checks.choice(self.method, "method", METHODS)
+        if self.min_disparity is not None:
+            checks.integer(self.min_disparity, "min_disparity", at_least=-4096, at_most=4096)
+        if self.disparities is not None:
+            checks.integer(self.disparities, "disparities", at_least=STEP, at_most=4096)
+            if self.disparities % STEP:
+                raise ValueError(f"disparities must be a multiple of {STEP}, got {self.disparities}")
+        checks.integer(self.block, "block", at_least=1, at_most=51)
+        if self.block % 2 == 0:
+            raise ValueError(f"block must be odd, got {self.block}")
+        if len(self.smoothness) != 2 or not 0 < self.smoothness[0] < self.smoothness[1]:
+            raise ValueError(f"smoothness must be two prices, 0 < first < second, got {self.smoothness}")
+        checks.integer(self.uniqueness, "uniqueness", at_least=0, at_most=100)
+        if self.left_right_px is not None:
+            checks.number(self.left_right_px, "left_right_px", above=0.0)
+        checks.integer(self.speckle_px, "speckle_px", at_least=0)
+        checks.integer(self.edge_px, "edge_px", at_least=0, at_most=20)
+        checks.number(self.disparity_std_px, "disparity_std_px", above=0.0)

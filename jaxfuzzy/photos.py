@@ -1,0 +1,245 @@
+"""Photographs before matching: reading them, what they say about their rectification, and rectifying them."""
+
+import dataclasses
+import io
+import os
+import re
+import zipfile
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxfuzzy import checks
+from jaxfuzzy.files import read_bytes
+from jaxfuzzy.rig import Rig
+
+Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
+
+ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
+
+
+def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
+    """Two images ready for matching: uint8, the same size and number of channels, the size of the rig.
+
+    16-bit and floating-point images are scaled to 8 bits by the larger maximum of the two; a grey image beside a color
+    one makes both grey; an opaque alpha channel is dropped.
+
+    Raises:
+        FileNotFoundError: An image does not exist.
+        ValueError: An image cannot be used, or sizes disagree.
+        TypeError: An argument is neither a path nor an array.
+    """
+    images = [_image(value, name) for value, name in ((left, "left"), (right, "right"))]
+    if images[0].shape[:2] != images[1].shape[:2]:
+        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]
+        raise ValueError(f"left and right must have the same size, got {sizes[0]} and {sizes[1]}")
+    height, width = images[0].shape[:2]
+    if rig.image_size is not None and (width, height) != rig.image_size:
+        raise ValueError(
+            f"images must have the size the rig is for, {rig.image_size[0]} x {rig.image_size[1]}, got {width} x"
+            f" {height}; rig.scaled(({width}, {height})) makes the rig of resized images"
+        )
+    if images[0].dtype != images[1].dtype:
+        raise ValueError(f"left and right must have the same type, got {images[0].dtype} and {images[1].dtype}")
+    if images[0].dtype != np.uint8:
+        top = max(float(image.max()) for image in images)
+        images = [(image * (255.0 / max(top, 1e-12)) + 0.5).astype(np.uint8) for image in images]
+    if images[0].ndim != images[1].ndim:
+        images = [grey(image) for image in images]
+    return images[0], images[1]
+
+
+def _image(value: Any, name: str) -> np.ndarray:
+    if isinstance(value, str | os.PathLike):
+        data = np.frombuffer(read_bytes(value, f"{name} image"), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise ValueError(f"{name} is not an image that can be read: {os.fspath(value)}")
+    elif value is None:
+        raise TypeError(f"{name} must be an image or a path, got None")
+    else:
+        image = np.asarray(value)
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
+    if image.ndim == 3 and image.shape[2] == 4:
+        opaque = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(image.dtype, 1.0)
+        if not np.all(image[:, :, 3] == opaque):
+            raise ValueError(f"{name} has transparent pixels, whose color is unknown: remove the alpha channel")
+        image = image[:, :, :3]
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
+        raise ValueError(f"{name} must be grey (H, W) or BGR (H, W, 3), got shape {image.shape}")
+    if image.dtype.kind == "f":
+        if not np.all(np.isfinite(image)) or image.min() < 0:
+            raise ValueError(f"{name} must be finite and not negative")
+    elif image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{name} must be uint8, uint16 or floating point, got {image.dtype}")
+    return image
+
+
+def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.ndarray:
+    """Reads a ready disparity map, float32 (H, W) in pixels; NaN where it is unknown.
+
+    Args:
+        path: A PFM file (rows from the bottom, infinite where unknown), a PNG or TIFF (0 where unknown), or NPY or NPZ
+            with one map (not finite where unknown).
+        scale: What the file's numbers are divided by: 4 for Middlebury 2003, 8 for 2001, 3 and 2 for the third and half
+            sizes of 2005 and 2006, 16 for OpenCV's fixed point, 256 for KITTI. The number in a PFM header is no scale.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no disparity map.
+    """
+    checks.number(scale, "scale", above=0.0)
+    data = read_bytes(path, "disparity")
+    try:
+        if data.startswith((b"Pf", b"PF")):
+            values = _pfm(data)
+        elif data.startswith((b"\x93NUMPY", b"PK")):
+            loaded = np.load(io.BytesIO(data), allow_pickle=False)
+            arrays = [loaded] if isinstance(loaded, np.ndarray) else [loaded[name] for name in loaded.files]
+            if len(arrays) != 1:
+                raise ValueError(f"holds {len(arrays)} arrays, one is needed")
+            values = arrays[0]
+        else:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if image is None:
+                raise ValueError("is no image, PFM, NPY or NPZ file")
+            # Middlebury's 2001 maps are grey stored as color.
+            values = image[:, :, 0] if image.ndim == 3 and np.ptp(image[:, :, :3], axis=2).max() == 0 else image
+        if values.ndim != 2 or values.dtype.kind not in "fiu":
+            raise ValueError(f"must hold one number a pixel, got {values.dtype} {values.shape}")
+    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"disparity {os.fspath(path)} {error}".replace("\n", " ")) from None
+    known = np.isfinite(values) if values.dtype.kind == "f" else values > 0
+    return np.where(known, values.astype(np.float32) / np.float32(scale), np.float32(np.nan))
+
+
+def _pfm(data: bytes) -> np.ndarray:
+    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", data)
+    if head is None:
+        raise ValueError("is not a PFM file of one channel")
+    width, height = int(head[1]), int(head[2])
+    kind = np.dtype("<f4" if float(head[3]) < 0 else ">f4")
+    if len(data) - head.end() < width * height * kind.itemsize:
+        raise ValueError(f"is cut short: {width} x {height} pixels are promised")
+    return np.frombuffer(data, kind, width * height, head.end()).reshape(height, width)[::-1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alignment:
+    """What features common to both images say about their rectification.
+
+    Attributes:
+        matches: How many features support it; 0 where there were too few to say anything.
+        rows_px: How much further down the right image shows things; 0 for a rectified pair.
+        disparity_px: How much further left: the fifth, fiftieth and ninety-fifth of a hundred.
+        swapped: Whether nearly everything appears further right in the right image.
+    """
+
+    matches: int
+    rows_px: float
+    disparity_px: tuple[float, float, float]
+    swapped: bool
+
+
+def alignment(left: Image, right: Image) -> Alignment:
+    """Compares the places of ORB features (Rublee et al., ICCV 2011) in two images, without any calibration.
+
+    Semi-global matching searches rows only: with rows 2 px apart half of its answers are gone, with 6 px nearly all.
+    """
+    shrink = -(-left.shape[1] // ALIGNMENT_WIDTH)
+    size = (max(1, left.shape[1] // shrink), max(1, left.shape[0] // shrink))
+    detector = cv2.ORB.create(FEATURES, fastThreshold=7)
+    found = [
+        detector.detectAndCompute(cv2.resize(grey(image), size, interpolation=cv2.INTER_AREA), None)
+        for image in (left, right)
+    ]
+    (left_points, left_codes), (right_points, right_codes) = found
+    if left_codes is None or right_codes is None:
+        return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_codes, right_codes)
+    moves = np.array(
+        [np.subtract(left_points[pair.queryIdx].pt, right_points[pair.trainIdx].pt) for pair in pairs]
+    ).reshape(-1, 2) * [shrink, -shrink]  # fmt: skip
+    # Wrong pairs lie anywhere, right ones share their rows: the densest ten rows hold them.
+    rows = np.sort(moves[:, 1])
+    if len(rows) < FEWEST_FEATURES:
+        return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
+    held = np.searchsorted(rows, rows + 10) - np.arange(len(rows))
+    middle = np.median(rows[held.argmax() :][: held.max()])
+    good = moves[np.abs(moves[:, 1] - middle) <= 2.5 * shrink]
+    if len(good) < FEWEST_FEATURES:
+        return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
+    across = np.percentile(good[:, 0], [5, 50, 95])
+    return Alignment(
+        matches=len(good),
+        rows_px=float(good[:, 1].mean()),
+        disparity_px=(float(across[0]), float(across[1]), float(across[2])),
+        swapped=bool(np.mean(good[:, 0] < -1) > 0.9),
+    )
+
+
+def rectify(left: Any, right: Any, rig: Rig) -> tuple[Image, Image, Rig]:
+    """Undistorts and turns both images of a raw pair so that rows correspond, and gives the rig of the new images.
+
+    Black borders are cut away inside the new images (OpenCV's alpha = 0), so that nothing is matched that was not seen.
+
+    Args:
+        left: The left image, as the camera took it: a path or an array.
+        right: The right image.
+        rig: The rig with rotation and translation.
+
+    Returns:
+        Both rectified images and their rig, whose left camera is turned against that of `rig`.
+
+    Raises:
+        ValueError: The rig is rectified already, or images and rig do not fit.
+    """
+    left, right = read_pair(left, right, rig)
+    if rig.rectified or rig.translation is None:
+        raise ValueError("rig must have rotation and translation to rectify by; this one is rectified already")
+    size = (left.shape[1], left.shape[0])
+    cameras = [
+        np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
+        for focal, center in (
+            (rig.focal_px, rig.center_px),
+            (rig.right_focal_px or rig.focal_px, rig.right_center_px or rig.center_px),
+        )
+    ]
+    lenses = [np.array(lens) if lens else np.zeros(5) for lens in rig.distortion or ((), ())]
+    turn_left, turn_right, project_left, project_right = cv2.stereoRectify(
+        cameras[0],
+        lenses[0],
+        cameras[1],
+        lenses[1],
+        size,
+        np.array(rig.rotation),
+        np.array(rig.translation)[:, None],
+        alpha=0,
+    )[:4]
+    turns, projections = (turn_left, turn_right), (project_left, project_right)
+    images = [
+        cv2.remap(
+            image, *cv2.initUndistortRectifyMap(camera, lens, turn, projection, size, cv2.CV_32FC1), cv2.INTER_LINEAR
+        )
+        for image, camera, lens, turn, projection in zip(
+            (left, right), cameras, lenses, turns, projections, strict=True
+        )
+    ]
+    straight = Rig(
+        focal_px=(project_left[0, 0], project_left[1, 1]),
+        center_px=(project_left[0, 2], project_left[1, 2]),
+        baseline_m=-project_right[0, 3] / project_right[0, 0],
+        image_size=size,
+        doffs_px=project_right[0, 2] - project_left[0, 2],
+        max_disparity_px=rig.max_disparity_px,
+        metric=rig.metric,
+        calibration=rig.calibration,
+    )
+    return images[0], images[1], straight
+
+
+def grey(image: Image) -> Image:
+    """One channel."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
