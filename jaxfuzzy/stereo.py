@@ -98,7 +98,7 @@ def disparity(
         raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
     low, count = search_range(left, right, rig, matcher)
     values = _match(left, right, low, count, matcher)
-    valid = values >= low
+    valid = (values >= low) & (values + rig.doffs_px > 0) & _textured(left)
     if matcher.left_right_px is not None:
         mirrored = _match(right[:, ::-1], left[:, ::-1], low, count, matcher)[:, ::-1]
         valid &= _agrees(values, mirrored, low, matcher.left_right_px)
@@ -191,6 +191,12 @@ def _agrees(values: np.ndarray, mirrored: np.ndarray, low: int, tolerance: float
     inside = (values >= low) & (columns >= 0) & (columns < width)
     other = np.take_along_axis(mirrored, np.clip(columns, 0, width - 1), axis=1)
     return inside & (other >= low) & (np.abs(other - values) <= tolerance)
+
+
+def _textured(image: Image, side: int = 15) -> np.ndarray:
+    """Where there is any texture at all near a pixel: what is of one grey (overexposed, say) matches everywhere."""
+    around = np.ones((side, side), np.uint8)
+    return cv2.dilate(grey(image), around) != cv2.erode(grey(image), around)
 
 
 def _edges(values: np.ndarray, valid: np.ndarray, radius: int, jump: float = 2.0) -> np.ndarray:
