@@ -244,6 +244,8 @@ def table_scene(
                     taken.append((x, z, size))
                     objects.append(_random_object(kind, size, place(x, z), ground, rng))
                     break
+            else:
+                break
         setting = Setting(tuple(objects), ground)
         if len(objects) == count and _in_view(setting, rig):
             return setting
