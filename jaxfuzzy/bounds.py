@@ -110,7 +110,7 @@ def assembled(
     if kind == "box":
         c, s = jnp.cos(theta[0]), jnp.sin(theta[0])
         axes = jnp.stack([jnp.stack([c, zero, s]), jnp.stack([zero, zero + 1, zero]), jnp.stack([-s, zero, c])])
-        face = theta[1:]
+        face = theta[1:4]
         low = jnp.where(signs < 0, face, low)[jnp.array([0, 2, 1])]
         high = jnp.where(signs > 0, face, high)[jnp.array([0, 2, 1])]
         return Box(

@@ -16,6 +16,8 @@ from jaxfuzzy.rays import Residual, View
 
 EM_STEPS = 4
 HALF_LOG_2PI = 0.9189385332046727
+# In nats: a plane is taken unless something else is better by more than chance and small errors of the model make it.
+PLANE_BONUS = 20.0
 
 
 class Mixture(NamedTuple):
@@ -49,7 +51,12 @@ def mixture(residual: Residual, view: View, depth_range: Array, scale_bounds: tu
     count = view.mask.sum() + 1e-9
 
     def logs(background: Array, scale: Array) -> tuple[Array, Array]:
-        surface = -0.5 * square / (scale**2)[:, None] - jnp.log(scale)[:, None] - residual.log_std - HALF_LOG_2PI
+        surface = (
+            -0.5 * square / (scale**2)[:, None]
+            - jnp.log(scale)[:, None]
+            - 0.5 * jnp.log(residual.variance)
+            - HALF_LOG_2PI
+        )
         return jnp.log1p(-background)[:, None] + surface, jnp.log(background)[:, None] + outside
 
     def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -108,3 +115,8 @@ def _picture(view: View) -> tuple[Array, ...]:
         return view.point
     u, v, w = view.ray
     return u / w, v / w
+
+
+def stout(radius: Array) -> Array:
+    """A radius must be neither nothing nor so large that the surface is flat over the object."""
+    return (radius > 0.01) & (radius < 4.0)

@@ -1,11 +1,10 @@
-"""The winner on all points: Gauss-Newton under mixture memberships until it stands still, and its covariance.
+"""The winner on all points: Gauss-Newton steps under mixture memberships until it stands still, and its covariance.
 
-The axis is free to lean, with a prior of ten degrees, so that an upright frame known to a degree or two does no harm. Weights are the probabilities
-of belonging to the surface; they fall off for good points too, which the plain inverse normal matrix does not know. The covariance is
-therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Jᵀ (Huber, Robust Statistics, 1981).
+The axis is free to lean, with a prior of ten degrees, so that an upright frame known to a few degrees does no harm. Weights
+are the probabilities of belonging to the surface; they fall off for good points too, which the plain inverse normal matrix
+does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Jᵀ (Huber, Robust Statistics, 1981).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -16,21 +15,22 @@ from jaxfuzzy import rays, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.choice import HALF_LOG_2PI
 from jaxfuzzy.rays import Residual, View
+from jaxfuzzy.search import Candidates
 
 MOST_STEPS = 40
 LEAN_PRIOR = 0.1745
+PLANE, BOX, REVOLUTION, SPHERE = range(4)
 
 
 class Polished(NamedTuple):
-    """A surface on all points: its four parameters, the rotation into its own frame, noise and covariance.
+    """A surface on all points: parameters, noise and covariance.
 
     Attributes:
-        theta: Parameters as in `rays` (4,).
-        rotation: Rotation into the frame in which the axis is y (3, 3).
+        theta: Parameters as in `rays` (5,).
+        turn: Rotation into the frame in which the axis is y (3, 3).
         scale: Noise in units of the points' own deviations.
         background: Share of background.
-        covariance: Of (theta, lean about x, lean about z), (6, 6).
-        ownership: Probability that each point belongs to the surface (N,).
+        covariance: Of (theta, lean about x, lean about z), (7, 7).
         square: Squared residual of each point in deviations (N,).
         depth: From each point along its ray to the surface (N,).
         part: Which part of the surface each point met (N,).
@@ -38,105 +38,129 @@ class Polished(NamedTuple):
     """
 
     theta: Array
-    rotation: Array
+    turn: Array
     scale: Array
     background: Array
     covariance: Array
-    ownership: Array
     square: Array
     depth: Array
     part: Array
     moved: Array
 
 
+class _Look(NamedTuple):
+    """What one look at the points gives: derivatives (7, N), residual, its square, membership, and the residual's extras."""
+
+    rows: Array
+    error: Array
+    square: Array
+    own: Array
+    variance: Array
+    part: Array
+
+
+class _State(NamedTuple):
+    step: Array
+    theta: Array
+    turn: Array
+    scale: Array
+    background: Array
+    look: _Look
+    moved: Array
+
+
 def polish(
-    surface: Callable[[Array, View], Residual],
-    free: Array,
+    family: Array,
+    candidate: Candidates,
     view: View,
-    theta: Array,
     scale: Array,
     background: Array,
     depth_range: Array,
     scale_bounds: tuple[float, float],
     tolerance: float,
-    gauge: bool = False,
 ) -> Polished:
-    """Moves one surface to the maximum of its likelihood; `free` (6,) says which of theta and lean may move.
+    """Moves one surface to the maximum of its likelihood on all points.
 
-    With `gauge` the length of theta means nothing and is kept.
+    Args:
+        family: `PLANE`, `BOX`, `REVOLUTION` or `SPHERE`.
+        candidate: Where to start, a single candidate without leading axis.
+        view: All points.
+        scale: Noise to start from.
+        background: Share of background to start from.
+        depth_range: Range of depth over which background is spread.
+        scale_bounds: Least and largest noise scale.
+        tolerance: Stop when no parameter changes by more, in units of the object's spread.
     """
     outside = -jnp.log(depth_range * view.gain)
     count = view.mask.sum()
-    prior = jnp.concatenate([jnp.zeros(4, theta.dtype), jnp.full(2, 1 / LEAN_PRIOR**2, theta.dtype)]) * free
+    free, dtype = candidate.free, view.gain.dtype
+    prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / LEAN_PRIOR**2 * free
 
-    def look(theta: Array, rotation: Array, scale: Array, background: Array) -> tuple[Array, Array, Array, Array]:
-        r = surface(theta[None], rays.turned(view, rotation[None]))
+    def surface(theta: Array, turn: Array) -> Residual:
+        seen, detail = rays.turned(view, turn[None]), candidate.detail[None]
+        families = (
+            lambda t: rays.plane(t, seen),
+            lambda t: rays.box(t, detail, seen),
+            lambda t: rays.revolution(t, None if view.ray is None else detail, seen),
+            lambda t: rays.sphere(t, seen),
+        )
+        return lax.switch(family, families, theta[None])
+
+    def look(theta: Array, turn: Array, scale: Array, background: Array) -> _Look:
+        r = surface(theta, turn)
         square = (r.error**2 + r.miss**2)[0]
-        on = jnp.log1p(-background) - 0.5 * square / scale**2 - jnp.log(scale) - r.log_std[0] - HALF_LOG_2PI
+        on = jnp.log1p(-background) - 0.5 * (square / scale**2 + jnp.log(r.variance[0])) - jnp.log(scale) - HALF_LOG_2PI
         own = jax.nn.sigmoid(on - jnp.log(background) - outside) * view.mask
         rows = jnp.concatenate([*r.slopes, r.spins[0], r.spins[2]], 0) * free[:, None]
-        return rows, r.error[0], square, own
+        return _Look(rows, r.error[0], square, own, r.variance[0], r.part[0])
 
     def normal(theta: Array, rows: Array, weight: Array, scale: Array) -> Array:
         matrix = (rows * weight) @ rows.T / scale**2 + jnp.diag(prior)
-        idle = jnp.concatenate([theta, jnp.zeros(2, theta.dtype)]) * gauge
-        return matrix + jnp.trace(matrix) * idle[:, None] * idle / (idle @ idle + 1e-30)
+        # The length of a plane's parameters means nothing and is kept.
+        idle = jnp.concatenate([theta, jnp.zeros(2, dtype)]) * (family == PLANE)
+        matrix = matrix + jnp.trace(matrix) * idle[:, None] * idle / (idle @ idle + 1e-30)
+        return matrix + jnp.diag(1e-9 * jnp.abs(jnp.diag(matrix)).max() + (1 - free))
 
-    def step(state: tuple) -> tuple:
-        i, theta, rotation, scale, background, _ = state
-        rows, error, square, own = look(theta, rotation, scale, background)
-        lean = 0.5 * jnp.array([rotation[2, 1] - rotation[1, 2], rotation[1, 0] - rotation[0, 1]])
-        downhill = (rows * own) @ error / scale**2 + prior * jnp.concatenate([jnp.zeros(4, theta.dtype), lean])
-        matrix = normal(theta, rows, own, scale)
-        diagonal = jnp.diag(matrix)
-        matrix = matrix + jnp.diag(1e-5 * diagonal + 1e-9 * diagonal.max() + (1 - free))
+    def step(state: _State) -> _State:
+        _, theta, turn, scale, background, seen, _ = state
+        lean = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[1, 0] - turn[0, 1]])
+        downhill = (seen.rows * seen.own) @ seen.error / scale**2 + prior * jnp.concatenate([jnp.zeros(5, dtype), lean])
+        matrix = normal(theta, seen.rows, seen.own, scale)
+        matrix = matrix + jnp.diag(1e-5 * jnp.diag(matrix))
+        first = state.step == 0
         move = -starts.invert(matrix, downhill[:, None])[:, 0] * free
-        move = jnp.clip(move, -0.2, 0.2)
-        total = own.sum()
-        new_scale = jnp.clip(jnp.sqrt((own * square).sum() / (total + 1e-9)), *scale_bounds)
-        new_background = jnp.clip(1 - total / count, 1e-3, 0.999)
+        move = jnp.where(first, 0.0, jnp.clip(move, -0.2, 0.2))
+        total = seen.own.sum()
+        to_scale = jnp.clip(jnp.sqrt((seen.own * seen.square).sum() / (total + 1e-9)), *scale_bounds)
+        to_background = jnp.clip(1 - total / count, 1e-3, 0.999)
+        to_scale, to_background = jnp.where(first, scale, to_scale), jnp.where(first, background, to_background)
+        # Noise and share matter to the parameters only through the weights: a hundredth as much.
         moved = jnp.maximum(
-            jnp.abs(move).max(), 1e-2 * jnp.maximum(jnp.abs(new_scale - scale), jnp.abs(new_background - background))
+            jnp.abs(move).max(), 0.01 * jnp.maximum(jnp.abs(to_scale - scale), jnp.abs(to_background - background))
         )
-        return i + 1, theta + move[:4], _turn(move[4], move[5]) @ rotation, new_scale, new_background, moved
+        theta, turn = theta + move[:5], starts.rotation(move[5], move[6]) @ turn
+        seen = look(theta, turn, to_scale, to_background)
+        return _State(state.step + 1, theta, turn, to_scale, to_background, seen, jnp.where(first, jnp.inf, moved))
 
-    state = (0, theta, jnp.eye(3, dtype=theta.dtype), scale, background, jnp.asarray(jnp.inf, theta.dtype))
-    state = lax.while_loop(lambda s: (s[0] < MOST_STEPS) & (s[5] > tolerance), step, state)
-    _, theta, rotation, scale, background, moved = state
-    rows, error, square, own = look(theta, rotation, scale, background)
-    last = surface(theta[None], rays.turned(view, rotation[None]))
+    blank = jnp.zeros_like(view.gain)
+    nothing = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank, blank, jnp.zeros(len(blank), jnp.int32))
+    start = _State(
+        jnp.asarray(0), candidate.theta, candidate.turn, scale, background, nothing, jnp.asarray(jnp.inf, dtype)
+    )
+    end = lax.while_loop(lambda s: (s.step < MOST_STEPS) & (s.moved > tolerance), step, start)
+    seen = end.look
     # ψ = own · e and its derivative, with d(own)/de = -own (1 - own) e / scale².
-    influence = own * error / scale
-    bend = own * (1 - (1 - own) * error**2 / scale**2)
-    bread = normal(theta, rows, bend, scale)
-    diagonal = jnp.diag(bread)
-    bread = bread + jnp.diag(1e-9 * jnp.abs(diagonal).max() + (1 - free))
-    inverse = jnp.linalg.inv(bread)
-    meat = (rows * influence**2) @ rows.T / scale**2
+    bend = seen.own * (1 - (1 - seen.own) * seen.error**2 / end.scale**2)
+    inverse = jnp.linalg.inv(normal(end.theta, seen.rows, bend, end.scale))
+    meat = (seen.rows * (seen.own * seen.error / end.scale) ** 2) @ seen.rows.T / end.scale**2
     return Polished(
-        theta=theta,
-        rotation=rotation,
-        scale=scale,
-        background=background,
+        theta=end.theta,
+        turn=end.turn,
+        scale=end.scale,
+        background=end.background,
         covariance=inverse @ meat @ inverse.T * (free[:, None] * free),
-        ownership=own,
-        square=square,
-        depth=-(last.error * jnp.exp(last.log_std))[0] / view.gain,
-        part=last.part[0],
-        moved=moved,
-    )
-
-
-def _turn(about_x: Array, about_z: Array) -> Array:
-    """The rotation by a vector (about_x, 0, about_z), by Rodrigues' formula with its limit at no turn."""
-    square = about_x**2 + about_z**2
-    angle = jnp.sqrt(square + 1e-30)
-    zero = jnp.zeros_like(square)
-    cross = jnp.stack(
-        [jnp.stack([zero, -about_z, zero]), jnp.stack([about_z, zero, -about_x]), jnp.stack([zero, about_x, zero])]
-    )
-    return (
-        jnp.eye(3, dtype=square.dtype)
-        + jnp.sinc(angle / jnp.pi) * cross
-        + 0.5 * jnp.sinc(angle / (2 * jnp.pi)) ** 2 * cross @ cross
+        square=seen.square,
+        depth=-seen.error * jnp.sqrt(seen.variance) / view.gain,
+        part=seen.part,
+        moved=end.moved,
     )

@@ -12,6 +12,7 @@ are in units of each point's own deviation; H hypotheses at once, arrays (H, N).
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 
 from jaxfuzzy.arrays import Array
 
@@ -20,6 +21,10 @@ SIDEWAYS = 0.2
 # Near a silhouette depth and slope of a residual grow without bound: cosines of incidence below this are taken as this.
 GRAZING = 0.12
 TINY = 1e-12
+# Depth of a ray that meets nothing, in units of the object's spread.
+FAR = 1e2
+# Ends of a body of revolution: the side alone, a lid on top, or open with the inside seen over the rim.
+SIDE, CLOSED, OPEN = 0, 1, 2
 
 
 class View(NamedTuple):
@@ -46,9 +51,9 @@ class Residual(NamedTuple):
     Attributes:
         error: Measured less predicted depth (or signed distance, inwards positive), in deviations.
         miss: How far a ray passes by the surface, in deviations; 0 where it meets it.
-        slopes: Derivative of `error` by each parameter, (H, N) each.
+        slopes: Derivative of `error` by each of the five parameters, (H, N) each.
         spins: Derivative of `error` by a small turn of the points about x, y and z.
-        log_std: Logarithm of the residual's deviation in units of the point's own.
+        variance: Of the residual, in units of the point's own; slanted surfaces turn sideways errors into depth.
         part: Which part of the surface was met, an integer.
     """
 
@@ -56,7 +61,7 @@ class Residual(NamedTuple):
     miss: Array
     slopes: tuple[Array, ...]
     spins: tuple[Array, Array, Array]
-    log_std: Array
+    variance: Array
     part: Array
 
 
@@ -77,109 +82,147 @@ def taken(view: View, count: int) -> View:
 
 
 def plane(theta: Array, view: View) -> Residual:
-    """Plane n·x = k, theta (H, 4) = (n, k)."""
+    """Plane n·x = k, theta (H, 5) = (n, k, unused)."""
     n, k = tuple(theta[:, i, None] for i in range(3)), theta[:, 3, None]
     length = jnp.sqrt(_dot(n, n) + TINY)
     gap = (k - _dot(n, view.point)) / length
-    cosine = jnp.ones_like(gap) if view.ray is None else _dot(n, view.ray) / length
-    steep = jnp.where(jnp.abs(cosine) < 0.02, jnp.where(cosine < 0, -0.02, 0.02), cosine)
-    depth = -gap if view.ray is None else gap / steep
-    direction = tuple(-c / length for c in n) if view.ray is None else view.ray
+    if view.ray is None:
+        cosine, depth, outward = jnp.ones_like(gap), -gap, 1.0
+        direction = tuple(-c / length for c in n)
+    else:
+        direction = view.ray
+        cosine = _dot(n, direction) / length
+        # F must grow towards the camera, whichever way the normal points.
+        outward = jnp.where(cosine < 0, 1.0, -1.0)
+        cosine = jnp.maximum(jnp.abs(cosine), 0.02)
+        depth = -gap * outward / cosine
     hit = _along(view.point, direction, depth)
-    # F must grow towards the camera, whichever way the normal points.
-    outward = 1.0 if view.ray is None else -jnp.sign(steep)
     normal = tuple(c * outward / length for c in n)
     slopes = (*(c * outward / length for c in hit), -outward / length)
-    return _residual(view, depth, 0.0, jnp.abs(steep), jnp.abs(steep), hit, normal, slopes)
+    return _residual(view, depth, 0.0, cosine, cosine, hit, normal, slopes)
 
 
 def sphere(theta: Array, view: View) -> Residual:
-    """Sphere, theta (H, 4) = (center, radius)."""
+    """Sphere, theta (H, 5) = (center, radius, unused)."""
     radius = jnp.abs(theta[:, 3, None]) + 1e-4
     away = tuple(p - theta[:, i, None] for i, p in enumerate(view.point))
     square = _dot(away, away)
     if view.ray is None:
         far = jnp.sqrt(square + TINY)
-        depth, miss, fall = far - radius, jnp.zeros_like(far), radius
+        depth, miss, fall = far - radius, 0.0, radius
         direction = tuple(-c / far for c in away)
     else:
         direction = view.ray
         half, constant = _dot(away, direction), square - radius**2
         inside = half**2 - constant
-        depth, fall = _first_root(1.0, half, constant, inside)
+        root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
+        depth, fall = _nearer(jnp.ones_like(half), half, constant, inside, root), root
         miss = jnp.maximum(-inside, 0.0) / (2 * radius)
     hit = _along(away, direction, depth)
     place = _along(view.point, direction, depth)
-    slopes = (*(-c for c in hit), -radius)
-    return _residual(view, depth, miss, fall, fall / radius, place, hit, slopes, radius)
+    return _residual(view, depth, miss, fall, fall / radius, place, hit, (*(-c for c in hit), -radius), radius)
 
 
-def revolution(theta: Array, view: View) -> Residual:
-    """Side of a cylinder or cone about y, theta (H, 4) = (x, z, radius at y = 0, how much it narrows a unit of y)."""
+def revolution(theta: Array, detail: Array | None, view: View) -> Residual:
+    """Cylinder or cone about y: theta (H, 5) = (x, z, radius at y = 0, how much it narrows a unit of y, level).
+
+    Args:
+        theta: Parameters.
+        detail: None for the endless side alone, else (H, 3): kind of end (`SIDE`, `CLOSED` or `OPEN`), height of the rim,
+            unused. The level is the height of the lid of a closed body, of the floor of an open one.
+        view: The points. The camera is above the rim.
+    """
     a, b, r0, narrowing = (theta[:, i, None] for i in range(4))
     x, y, z = view.point
     dx, dz, rim = x - a, z - b, r0 - narrowing * y
-    lean = jnp.sqrt(1 + narrowing**2)
+    lean = lax.optimization_barrier(jnp.sqrt(1 + narrowing**2))
     if view.ray is None:
         far = jnp.sqrt(dx**2 + dz**2 + TINY)
-        depth = (far - rim) / lean
+        depth, miss = (far - rim) / lean, 0.0
         direction = (-dx / far / lean, -narrowing / lean + 0 * far, -dz / far / lean)
-        miss = jnp.zeros_like(far)
     else:
-        direction = view.ray
-        u, v, w = direction
+        direction = u, v, w = view.ray
         square = u * u + w * w - (narrowing * v) ** 2
         half = dx * u + dz * w + narrowing * v * rim
         constant = dx * dx + dz * dz - rim * rim
         inside = half * half - square * constant
-        depth, fall = _first_root(square, half, constant, inside)
+        root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
+        depth = _nearer(square, half, constant, inside, root)
         miss = jnp.maximum(-inside, 0.0)
+    inner: Array | float = 1.0
+    if detail is not None:
+        over = y + depth * v > jnp.where(detail[:, :1] == CLOSED, theta[:, 4, None], detail[:, 1, None])
+        back = over & (detail[:, :1] == OPEN)
+        depth = jnp.where(back, _farther(square, half, constant, root), depth)
+        inner = jnp.where(back, -1.0, 1.0)
     hx, hy, hz = _along((dx, y, dz), direction, depth)
     radius = r0 - narrowing * hy
     floor = jnp.maximum(radius, 0.02 * jnp.abs(r0) + 1e-4)
     if view.ray is None:
         fall = floor * lean
     else:
+        fall = root
         miss = miss / (2 * jnp.maximum(square, 0.05) * floor) + jnp.maximum(-radius, 0.0)
-    slopes = (-hx, -hz, -radius, radius * hy)
-    normal = (hx, narrowing * radius, hz)
-    return _residual(view, depth, miss, fall, fall / (floor * lean), (hx + a, hy, hz + b), normal, slopes, floor * lean)
+    normal = (hx * inner, narrowing * radius * inner, hz * inner)
+    slopes = (-hx * inner, -hz * inner, -radius * inner, radius * hy * inner)
+    place, length, cosine, part = (hx + a, hy, hz + b), floor * lean, fall / (floor * lean), None
+    if detail is not None:
+        # Over the rim: the lid of a closed body; of an open one the inner wall down to the floor.
+        level = theta[:, 4, None]
+        down = jnp.maximum(-v, 0.02)
+        flat = (over & (detail[:, :1] == CLOSED)) | (back & (hy < level))
+        drop = (y - level) / down
+        fx, fz = dx + drop * u, dz + drop * w
+        beyond = jnp.sqrt(fx**2 + fz**2 + TINY) - (r0 - narrowing * level)
+        above = jnp.where(back & ~flat, jnp.maximum(hy - detail[:, 1, None], 0.0), 0.0)
+        miss = jnp.where(flat, jnp.maximum(beyond, 0.0) * down + jnp.maximum(v, 0.0), miss) + above
+        depth = jnp.where(flat, drop, depth)
+        fall, length = jnp.where(flat, down, fall), jnp.where(flat, 1.0, length)
+        cosine = jnp.where(flat, down, cosine)
+        place = tuple(jnp.where(flat, f, p) for f, p in zip((fx + a, level, fz + b), place, strict=True))
+        normal = tuple(jnp.where(flat, f, n) for f, n in zip((0.0, 1.0, 0.0), normal, strict=True))
+        slopes = (*(jnp.where(flat, 0.0, c) for c in slopes), jnp.where(flat, -1.0, 0.0))
+        part = jnp.where(flat, 1, jnp.where(back, 2, 0))
+    return _residual(view, depth, miss, fall, cosine, place, normal, slopes, length, part)
 
 
 def box(theta: Array, signs: Array, view: View) -> Residual:
-    """Corner of a box, theta (H, 4) = (yaw, offsets of the faces along x', z', y), signs (H, 3) = outward side, 0 for no face.
+    """Corner of a box, theta (H, 5) = (yaw, offsets of the faces along x', z', y, unused).
 
     The faces of a convex corner meet a ray in turn; the last one entered is the one seen.
+
+    Args:
+        theta: Parameters.
+        signs: Outward side of each face (H, 3), 0 for no face.
+        view: The points.
     """
-    c, s = jnp.cos(theta[:, 0, None]), jnp.sin(theta[:, 0, None])
+    # Behind a barrier: else they are computed anew for every point.
+    c, s = lax.optimization_barrier((jnp.cos(theta[:, 0, None]), jnp.sin(theta[:, 0, None])))
     x, y, z = view.point
     across = (c * x + s * z, c * z - s * x, y)
-    offsets = tuple(theta[:, 1 + i, None] for i in range(3))
     side = tuple(signs[:, i, None] for i in range(3))
     if view.ray is None:
-        reach = [jnp.where(side[i] != 0, side[i] * (across[i] - offsets[i]), -1e3) for i in range(3)]
-        fall = [jnp.ones_like(reach[0])] * 3
+        fall = [jnp.where(side[i] != 0, 1.0, -1.0) for i in range(3)]
     else:
         u, v, w = view.ray
-        toward = (c * u + s * w, c * w - s * u, v)
-        fall = [-side[i] * toward[i] for i in range(3)]
-        reach = [
-            jnp.where(fall[i] > 0.02, side[i] * (across[i] - offsets[i]) / jnp.maximum(fall[i], 0.02), -1e3)
-            for i in range(3)
-        ]
+        fall = [-side[0] * (c * u + s * w), -side[1] * (c * w - s * u), -side[2] * v]
+    gaps = [side[i] * (across[i] - theta[:, 1 + i, None]) for i in range(3)]
+    reach = [jnp.where(fall[i] > 0.02, gaps[i] / jnp.maximum(fall[i], 0.02), -FAR) for i in range(3)]
     depth = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2])
-    part = jnp.where(depth <= reach[0], 0, jnp.where(depth <= reach[1], 1, 2))
-    own = [part == i for i in range(3)]
-    cosine = sum(jnp.where(own[i], fall[i], 0.0) for i in range(3))
-    unit = [jnp.where(own[i], side[i], 0.0) for i in range(3)]
+    own = (depth <= reach[0], depth <= reach[1], depth <= reach[2])
+    pick = lambda of: jnp.where(own[0], of[0], jnp.where(own[1], of[1], of[2]))
+    cosine = pick(fall)
+    unit = [jnp.where(own[0], side[0], 0.0), jnp.where(own[1] & ~own[0], side[1], 0.0)]
+    unit.append(jnp.where(own[0] | own[1], 0.0, side[2]))
     normal = (c * unit[0] - s * unit[1], unit[2], s * unit[0] + c * unit[1])
     direction = tuple(-n for n in normal) if view.ray is None else view.ray
+    # A ray that no face looks at is an outlier: far off, and without a say.
+    lost = depth <= -FAR
+    depth, cosine = jnp.where(lost, FAR, depth), jnp.maximum(cosine, 0.02)
     hit = _along(view.point, direction, depth)
     spin = unit[0] * (c * hit[2] - s * hit[0]) - unit[1] * (c * hit[0] + s * hit[2])
-    slopes = (spin, -unit[0], -unit[1], -unit[2])
-    found = depth > -1e2
-    depth, cosine = jnp.where(found, depth, 1e2), jnp.where(found, jnp.maximum(cosine, 0.02), 1.0)
-    slopes = tuple(jnp.where(found, column, 0.0) for column in slopes)
+    slopes = tuple(jnp.where(lost, 0.0, column) for column in (spin, -unit[0], -unit[1], -unit[2]))
+    part = jnp.where(own[0], 0, jnp.where(own[1], 1, 2))
     return _residual(view, depth, 0.0, cosine, cosine, hit, normal, slopes, part=part)
 
 
@@ -191,37 +234,43 @@ def _residual(
     cosine: Array,
     hit: tuple[Array, ...],
     normal: tuple[Array, ...],
-    slopes: tuple[Array, ...],
+    slopes: tuple[Array | float, ...],
     length: Array | float = 1.0,
     part: Array | None = None,
 ) -> Residual:
     """Residual from depth along the ray, `fall` = -∇F·d and `length` = |∇F|, both at the hit."""
-    gain = view.gain * jnp.ones_like(depth)
-    log_std = jnp.zeros_like(depth)
-    if view.ray is not None:
-        log_std = 0.5 * jnp.log1p(SIDEWAYS**2 / (cosine**2 + GRAZING**2))
-        gain = gain * jnp.exp(-log_std)
+    if view.ray is None:
+        variance, gain = jnp.ones_like(depth), view.gain * jnp.ones_like(depth)
+    else:
+        variance = 1 + SIDEWAYS**2 / (cosine**2 + GRAZING**2)
+        gain = view.gain * lax.rsqrt(variance)
         fall = jnp.sqrt(fall**2 + (GRAZING * length) ** 2)
     rate = -gain / fall
     x, y, z = hit
     p, q, r = normal
     spins = ((y * r - z * q) * rate, (z * p - x * r) * rate, (x * q - y * p) * rate)
+    unused = (jnp.zeros_like(depth),) * (5 - len(slopes))
     return Residual(
         error=-depth * gain,
         miss=miss * view.gain / SIDEWAYS * jnp.ones_like(depth),
-        slopes=tuple(column * rate for column in slopes),
+        slopes=(*(column * rate for column in slopes), *unused),
         spins=spins,
-        log_std=log_std,
+        variance=variance,
         part=jnp.zeros(depth.shape, jnp.int32) if part is None else part,
     )
 
 
-def _first_root(square: Array | float, half: Array, constant: Array, inside: Array) -> tuple[Array, Array]:
-    """Where a ray enters a t² square + 2 t half + constant = 0, and how steeply; its nearest place where it misses."""
-    root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
-    safe = jnp.where(jnp.abs(square) < 1e-3, 1e-3, square) * jnp.ones_like(half)
+def _nearer(square: Array, half: Array, constant: Array, inside: Array, root: Array) -> Array:
+    """Where a ray enters t² square + 2 t half + constant = 0; its nearest place where it misses."""
+    safe = jnp.where(jnp.abs(square) < 1e-3, 1e-3, square)
     enter = jnp.where(half < 0, constant / (root - half), -(half + root) / safe)
-    return jnp.where(inside < 0, -half / safe, enter), root
+    return jnp.where(inside < 0, -half / safe, enter)
+
+
+def _farther(square: Array, half: Array, constant: Array, root: Array) -> Array:
+    """Where a ray leaves it."""
+    safe = jnp.where(jnp.abs(square) < 1e-3, 1e-3, square)
+    return jnp.where(half > 0, -constant / (half + root), (root - half) / safe)
 
 
 def _along(point: tuple[Array, ...], direction: tuple[Array, ...], depth: Array) -> tuple[Array, ...]:

@@ -1,11 +1,10 @@
 """Search: from starts of every kind to the surface that explains an object best.
 
 Screen all starts by the noise-cluster objective on a few points, move the best of each kind by Gauss-Newton steps under
-memberships of a falling noise distance (m = 2: weight u² = (1 + D/δ²)⁻²), finish the best few on more points with the axis
-free to lean, choose by likelihood, and polish the winner on all points.
+memberships of a falling noise distance (m = 2: weight u² = (1 + D/δ²)⁻²), add lids and tops to the best, finish those on more
+points with the axis free to lean, and choose by likelihood.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,33 +15,89 @@ from jaxfuzzy import choice, rays, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.rays import Residual, View
 
+KINDS = ("plane", "box", "cylinder", "cone", "sphere")
 FEW, MORE = 256, 768
-KEPT, FINAL = 6, 2
+# How many of each kind are moved on a few points.
+KEPT = 6
 SCREEN = 2.0
 COARSE = tuple(np.geomspace(4.0, 2.5, 6))
-FINE = tuple(np.geomspace(3.0, 2.5, 4))
-KINDS = ("plane", "box", "cylinder", "cone", "sphere")
+FINE = tuple(np.geomspace(3.0, 2.5, 5))
 
-Surface = Callable[[Array, View], Residual]
+
+class Candidates(NamedTuple):
+    """Hypotheses of all families, one after the other: planes, boxes, bodies of revolution, spheres.
+
+    Attributes:
+        theta: Parameters as in `rays` (H, 5).
+        detail: Signs of a box, ends of a body of revolution (H, 3).
+        free: Which parameters may move, and whether the axis may lean about x and z (H, 7).
+        turn: Rotation into the frame in which the axis is y (H, 3, 3).
+    """
+
+    theta: Array
+    detail: Array
+    free: Array
+    turn: Array
+
+
+def residuals(candidates: Candidates, counts: tuple[int, int, int, int], view: View, lids: bool) -> Residual:
+    """Residuals of all candidates, families of the given sizes."""
+    cuts = np.cumsum((0, *counts))
+    families = [slice(a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+
+    def part(family: slice) -> View:
+        pick = lambda v: None if v is None else tuple(c if len(c) == 1 else c[family] for c in v)
+        return view._replace(point=pick(view.point), ray=pick(view.ray), eye=pick(view.eye))
+
+    p, b, r, s = families
+    theta, detail = candidates.theta, candidates.detail
+    each = [
+        rays.plane(theta[p], part(p)),
+        rays.box(theta[b], detail[b], part(b)),
+        rays.revolution(theta[r], detail[r] if lids else None, part(r)),
+        rays.sphere(theta[s], part(s)),
+    ]
+    join = lambda *a: jnp.concatenate(a)
+    return Residual(
+        error=join(*(r.error for r in each)),
+        miss=join(*(r.miss for r in each)),
+        slopes=tuple(join(*(r.slopes[i] for r in each)) for i in range(5)),
+        spins=tuple(join(*(r.spins[i] for r in each)) for i in range(3)),
+        variance=join(*(r.variance for r in each)),
+        part=join(*(r.part for r in each)),
+    )
 
 
 def descend(
-    surface: Surface, theta: Array, view: View, thresholds: tuple[float, ...], free: Array, largest: float = 0.5
-) -> Array:
-    """One damped Gauss-Newton step a threshold (noise distance in deviations), all hypotheses at once."""
-    steps = jnp.asarray(thresholds, theta.dtype)
+    candidates: Candidates,
+    counts: tuple[int, int, int, int],
+    view: View,
+    thresholds: tuple[float, ...],
+    largest: float,
+    lean: bool,
+    lids: bool,
+) -> tuple[Candidates, Array]:
+    """One damped Gauss-Newton step a threshold (noise distance in deviations), all candidates at once; and their costs before the last."""
+    steps = jnp.asarray(thresholds, candidates.theta.dtype)
+    size = 7 if lean else 5
 
-    def step(i: int, theta: Array) -> Array:
-        r = surface(theta, view)
-        weight = view.mask / (1 + (r.error**2 + r.miss**2) / steps[i] ** 2) ** 2
-        rows = jnp.stack([*r.slopes, r.error], 1)
+    def step(i: int, state: tuple[Candidates, Array]) -> tuple[Candidates, Array]:
+        now, _ = state
+        r = residuals(now, counts, rays.turned(view, now.turn) if lean else view, lids)
+        square = (r.error**2 + r.miss**2) / steps[i] ** 2
+        weight = view.mask / (1 + square) ** 2
+        cost = (view.mask * (square / (1 + square))).sum(-1)
+        rows = jnp.stack([*r.slopes, r.spins[0], r.spins[2], r.error] if lean else [*r.slopes, r.error], 1)
         normal = jnp.einsum("hin,hjn->hij", rows * weight[:, None], rows)
-        return theta + jnp.clip(_solve(normal, free), -largest, largest)
+        move = jnp.clip(_step(normal, now.free[:, :size]), -largest, largest)
+        turn = starts.rotation(move[:, 5], move[:, 6]) @ now.turn if lean else now.turn
+        return now._replace(theta=now.theta + move[:, :5], turn=turn), cost
 
-    return lax.fori_loop(0, len(thresholds), step, theta)
+    start = jnp.zeros(len(candidates.theta), steps.dtype)
+    return lax.fori_loop(0, len(thresholds), step, (candidates, start))
 
 
-def _solve(normal: Array, free: Array) -> Array:
+def _step(normal: Array, free: Array) -> Array:
     """The damped step from JᵀWJ and JᵀWe, stacked; parameters that are not free stay."""
     size = normal.shape[-1] - 1
     matrix = normal[:, :size, :size] * (free[:, :, None] * free[:, None, :])
@@ -52,136 +107,145 @@ def _solve(normal: Array, free: Array) -> Array:
     return -starts.invert(matrix, (normal[:, :size, size] * free)[..., None])[..., 0] * free
 
 
-def _best(values: Array, count: int) -> Array:
-    return lax.top_k(-values, count)[1]
-
-
 class Found(NamedTuple):
+    """The best candidate of each kind, in the order of `KINDS`, and which kind is best.
+
+    Attributes:
+        kind: Index of the best kind.
+        scores: Score of each kind, lower is better (5,).
+        candidates: The best candidate of each kind.
+        scale: Noise scale of each.
+        background: Share of background of each.
+    """
+
     kind: Array
     scores: Array
-    theta: Array
-    signs: Array
+    candidates: Candidates
     scale: Array
     background: Array
 
 
 def search(view: View, depth_range: Array, allowed: Array) -> Found:
+    """Finds the best surface of each kind and chooses among the allowed ones (5,)."""
     dtype = view.gain.dtype
     few, more = rays.taken(view, FEW), rays.taken(view, MORE)
-    ones = lambda count, *flags: jnp.broadcast_to(jnp.asarray(flags, dtype), (count, len(flags)))
-    screen = lambda surface, theta, c=SCREEN: choice.cost(surface(theta, few), few.mask, c)
-    absurd = lambda radius: jnp.where((radius > 4) | (radius < 0.02) | ~jnp.isfinite(radius), jnp.inf, 0.0)
-    window = starts.windows(few)
-    line_cylinders, line_cones = starts.front_lines(few)
-    rough = {
-        "cylinder": jnp.concatenate([window.cylinders, line_cylinders]),
-        "cone": jnp.concatenate([window.cones, line_cones]),
-    }
-    both = jnp.concatenate([rough["cylinder"], rough["cone"]])
-    price = screen(rays.revolution, both) + absurd(both[:, 2])
-    n = len(rough["cylinder"])
-    cylinders = rough["cylinder"][_best(price[:n], KEPT)]
-    cones = rough["cone"][_best(price[n:], KEPT)]
-    cones = jnp.concatenate([cones, *(cylinders[:4].at[:, 3].set(s) for s in (0.0, 0.3, 0.7))])
-    both = jnp.concatenate([cylinders, cones])
-    both = descend(
-        rays.revolution, both, few, COARSE, jnp.concatenate([ones(KEPT, 1, 1, 1, 0), ones(len(cones), 1, 1, 1, 1)])
-    )
-    price = screen(rays.revolution, both, 2.5)
-    cylinders, cones = both[:KEPT][_best(price[:KEPT], FINAL)], both[KEPT:][_best(price[KEPT:], FINAL)]
-
-    spheres = window.spheres[_best(screen(rays.sphere, window.spheres) + absurd(window.spheres[:, 3]), KEPT)]
-    spheres = descend(rays.sphere, spheres, few, COARSE, ones(KEPT, 1, 1, 1, 1))
-    spheres = spheres[_best(screen(rays.sphere, spheres, 2.5), FINAL)]
-
-    plane_price = screen(rays.plane, window.planes)
-    planes = window.planes[_best(plane_price, KEPT)]
-    planes = descend(rays.plane, planes, few, COARSE, ones(KEPT, 1, 1, 1, 1))
-    planes = planes[_best(screen(rays.plane, planes, 2.5), FINAL)]
-
-    upright = _best(jnp.where(jnp.abs(window.planes[:, 1]) < 0.5, plane_price, jnp.inf), starts.BOX_PLANES)
-    face, middle = window.planes[upright], window.middles[upright]
-    corner, corner_signs = starts.box_corners(few, face, middle)
-    ledge, ledge_signs = starts.box_ledges(few, face, middle)
-    box = lambda signs: lambda theta, view: rays.box(theta, signs, view)
-    flags = lambda signs: jnp.concatenate([jnp.ones_like(signs[:, :1]), jnp.abs(signs)], 1)
-    i = _best(screen(box(corner_signs), corner), KEPT)
-    j = _best(screen(box(ledge_signs), ledge), KEPT // 2)
-    boxes = jnp.concatenate([corner[i], ledge[j]])
-    signs = jnp.concatenate([corner_signs[i], ledge_signs[j]])
-    boxes = descend(box(signs), boxes, few, COARSE[:5], flags(signs), 0.3)
-    i = _best(screen(box(signs[:KEPT]), boxes[:KEPT]), 4)
-    topped, topped_signs = starts.box_tops(few, boxes[i], signs[i])
-    j = _best(screen(box(topped_signs), topped), KEPT // 2)
-    boxes, signs = jnp.concatenate([boxes, topped[j]]), jnp.concatenate([signs, topped_signs[j]])
-    boxes = descend(box(signs), boxes, few, COARSE[1:], flags(signs), 0.3)
-    price = screen(box(signs), boxes, 2.5)
-    a, b = KEPT, KEPT + KEPT // 2
-    i = jnp.concatenate([_best(price[:a], FINAL), a + _best(price[a:b], 1), b + _best(price[b:], 1)])
-    boxes, signs = boxes[i], signs[i]
-
-    # Finish.
-    both = descend(
-        rays.revolution,
-        jnp.concatenate([cylinders, cones]),
-        more,
-        FINE,
-        jnp.concatenate([ones(FINAL, 1, 1, 1, 0), ones(FINAL, 1, 1, 1, 1)]),
-        0.2,
-    )
-    spheres = descend(rays.sphere, spheres, more, FINE, ones(FINAL, 1, 1, 1, 1), 0.2)
-    planes = descend(rays.plane, planes, more, FINE, ones(FINAL, 1, 1, 1, 1), 0.2)
-    boxes = descend(box(signs), boxes, more, FINE, flags(signs), 0.2)
-    parts = [
-        rays.plane(planes, more),
-        rays.box(boxes, signs, more),
-        rays.revolution(both, more),
-        rays.sphere(spheres, more),
-    ]
-    joined = Residual(
-        *(
-            jnp.concatenate([getattr(p, f) for p in parts]) if f in ("error", "miss", "log_std", "part") else ()
-            for f in Residual._fields
-        )
-    )
-    mixed = choice.mixture(joined, more, depth_range, (0.35, 1.3))
-    theta = jnp.concatenate([planes, boxes, both, spheres])
+    coarse = _screened(few)
+    counts = (KEPT, KEPT + KEPT // 2, len(coarse.theta) - 3 * KEPT - KEPT // 2, KEPT)
+    coarse, price = descend(coarse, counts, few, COARSE, 0.5, False, False)
+    fine, counts = _finalists(coarse, price, counts, few)
+    fine, _ = descend(fine, counts, more, FINE, 0.2, True, True)
+    r = residuals(fine, counts, rays.turned(more, fine.turn), True)
+    mixed = choice.mixture(r, more, depth_range, (0.35, 1.6))
     count = more.mask.sum()
-    nb = len(boxes)
-    parameters = jnp.concatenate(
-        [jnp.full(FINAL, 3.0), 1 + jnp.abs(signs).sum(-1), jnp.full(FINAL, 3.0), jnp.full(2 * FINAL, 4.0)]
-    ).astype(dtype)
-    score = -mixed.log_likelihood + 0.5 * parameters * jnp.log(count)
-    at = np.cumsum([0, FINAL, nb, FINAL, FINAL, FINAL])
-    cut = lambda tree, k: Residual(
-        *(
-            t[at[k] : at[k + 1]] if f in ("error", "miss", "log_std", "part") else ()
-            for f, t in zip(Residual._fields, tree)
-        )
+    score = -mixed.log_likelihood + 0.5 * fine.free.sum(-1) * jnp.log(count)
+    p, b, n, s = (slice(i, j) for i, j in zip(np.cumsum((0, *counts[:-1])), np.cumsum(counts), strict=True))
+    part = lambda tree, cut: tree._replace(
+        **{k: getattr(tree, k)[cut] for k in tree._fields if k not in ("slopes", "spins")}
     )
-    cutm = lambda k: choice.Mixture(*(t[at[k] : at[k + 1]] for t in mixed))
+    height = rays.turned(more, fine.turn[n]).point[1]
+    tapers = choice.cone_tapers(fine.theta[n], part(mixed, n).ownership, height)
+    steep = fine.free[n][:, 3] > 0
     good = jnp.concatenate(
         [
-            jnp.ones(FINAL, bool),
-            choice.faces_hold(cut(joined, 1), signs, cutm(1), more),
-            cylinders_ok(theta[at[2] : at[3], 2]),
-            choice.cone_tapers(theta[at[3] : at[4]], cutm(3).ownership, more.point[1]),
-            cylinders_ok(theta[at[4] : at[5], 3]),
+            jnp.ones(counts[0], bool),
+            choice.faces_hold(part(r, b), fine.detail[b], part(mixed, b), more),
+            choice.stout(fine.theta[n][:, 2]) & (tapers | ~steep),
+            choice.stout(fine.theta[s][:, 3]),
         ]
     )
     score = jnp.where(good, score, jnp.inf)
-    score = score - jnp.concatenate([jnp.full(FINAL, 20.0), jnp.zeros(len(score) - FINAL)]).astype(dtype)
-    pick = jnp.stack([at[k] + jnp.argmin(score[at[k] : at[k + 1]]) for k in range(5)])
-    scores = jnp.where(allowed, score[pick], jnp.inf)
+    score = score - jnp.concatenate([jnp.full(counts[0], choice.PLANE_BONUS), jnp.zeros(sum(counts[1:]))]).astype(dtype)
+    # Free narrowing makes a body of revolution a cone.
+    kind = jnp.concatenate(
+        [jnp.full(counts[0], 0), jnp.full(counts[1], 1), jnp.where(steep, 3, 2), jnp.full(counts[3], 4)]
+    )
+    table = jnp.where(kind[None] == jnp.arange(5)[:, None], score[None], jnp.inf)
+    best = jnp.argmin(table, -1)
+    scores = jnp.where(allowed, table.min(-1), jnp.inf)
+    chosen = Candidates(*(c[best] for c in fine))
     return Found(
-        jnp.argmin(scores),
-        scores * view.mask.sum() / count,
-        theta[pick],
-        signs[pick[1] - at[1]],
-        mixed.scale[pick],
-        mixed.background[pick],
+        jnp.argmin(scores), scores * view.mask.sum() / count, chosen, mixed.scale[best], mixed.background[best]
     )
 
 
-def cylinders_ok(radius: Array) -> Array:
-    return (radius > 0.01) & (radius < 4.0)
+def _best(values: Array, count: int) -> Array:
+    return lax.top_k(-values, count)[1]
+
+
+def _flags(count: int, *flags: int) -> np.ndarray:
+    return np.broadcast_to(np.array(flags, float), (count, len(flags)))
+
+
+def _absurd(radius: Array) -> Array:
+    return jnp.where((radius > 4) | (radius < 0.02) | ~jnp.isfinite(radius), jnp.inf, 0.0)
+
+
+def _screened(few: View) -> Candidates:
+    """The best starts of each family."""
+    price = lambda r: choice.cost(r, few.mask, SCREEN)
+    dtype = few.gain.dtype
+    window = starts.windows(few)
+    line_cylinders, line_cones = starts.front_lines(few)
+    cylinders = jnp.concatenate([window.cylinders, line_cylinders])
+    cones = jnp.concatenate([window.cones, line_cones])
+    both = jnp.concatenate([cylinders, cones])
+    cost = price(rays.revolution(both, None, few)) + _absurd(both[:, 2])
+    cylinders = cylinders[_best(cost[: len(cylinders)], KEPT)]
+    cones = cones[_best(cost[len(cylinders) :][-len(cones) :], KEPT)]
+    sloped = [cylinders[:4].at[:, 3].set(s) for s in (0.0, 0.3, 0.7)]
+    spheres = window.spheres[_best(price(rays.sphere(window.spheres, few)) + _absurd(window.spheres[:, 3]), KEPT)]
+    cost = price(rays.plane(window.planes, few))
+    planes = window.planes[_best(cost, KEPT)]
+    upright = _best(jnp.where(jnp.abs(window.planes[:, 1]) < 0.5, cost, jnp.inf), starts.BOX_PLANES)
+    corner, corner_signs = starts.box_corners(few, window.planes[upright], window.middles[upright])
+    ledge, ledge_signs = starts.box_ledges(few, window.planes[upright], window.middles[upright])
+    i = _best(price(rays.box(corner, corner_signs, few)), KEPT)
+    j = _best(price(rays.box(ledge, ledge_signs, few)), KEPT // 2)
+    bodies = jnp.concatenate([cylinders, cones, *sloped])
+    theta = jnp.concatenate([planes, corner[i], ledge[j], bodies, spheres])
+    nb, nc = KEPT + KEPT // 2, len(bodies) - KEPT
+    detail = jnp.concatenate(
+        [jnp.zeros((KEPT, 3), dtype), corner_signs[i], ledge_signs[j], jnp.zeros((len(bodies) + KEPT, 3), dtype)]
+    )
+    free = jnp.concatenate(
+        [
+            _flags(KEPT, 1, 1, 1, 1, 0, 0, 0),
+            _box_flags(detail[KEPT : KEPT + nb]),
+            _flags(KEPT, 1, 1, 1, 0, 0, 1, 1),
+            _flags(nc, 1, 1, 1, 1, 0, 1, 1),
+            _flags(KEPT, 1, 1, 1, 1, 0, 0, 0),
+        ]
+    ).astype(dtype)
+    return Candidates(theta, detail, free, jnp.broadcast_to(jnp.eye(3, dtype=dtype), (len(theta), 3, 3)))
+
+
+def _box_flags(signs: Array) -> Array:
+    ones = jnp.ones_like(signs[:, :1])
+    return jnp.concatenate([ones, jnp.abs(signs), 0 * ones, ones, ones], 1)
+
+
+def _finalists(
+    coarse: Candidates, cost: Array, counts: tuple[int, ...], few: View
+) -> tuple[Candidates, tuple[int, int, int, int]]:
+    """The best two of each kind, the best boxes with a top, the best bodies of revolution with a lid or open."""
+    p, b, n, _ = np.cumsum(counts)
+    k = KEPT
+    planes = _best(cost[:p], 2)
+    corners = p + _best(cost[p : p + k], 4)
+    ledges = p + k + _best(cost[p + k : b], 1)
+    cylinders = b + _best(cost[b : b + k], 2)
+    cones = b + k + _best(cost[b + k : n], 2)
+    spheres = n + _best(cost[n:], 2)
+    take = lambda i: Candidates(*(c[i] for c in coarse))
+    corner = take(corners)
+    tops, signs = starts.box_tops(few, corner.theta, corner.detail)
+    i = _best(choice.cost(rays.box(tops, signs, few), few.mask, SCREEN), 2)
+    tops, signs = tops[i], signs[i]
+    topped = Candidates(tops, signs, _box_flags(signs), corner.turn[:2])
+    bodies = take(jnp.concatenate([cylinders, cones]))
+    bodies = bodies._replace(
+        detail=jnp.broadcast_to(jnp.array([rays.SIDE, 1e3, 0.0]), bodies.detail.shape).astype(few.gain.dtype)
+    )
+    groups = [take(planes), take(corners[:2]), take(ledges), topped, bodies, take(spheres)]
+    sizes = (2, 5, 4, 2)
+    return Candidates(*(jnp.concatenate(c) for c in zip(*groups, strict=True))), sizes

@@ -16,6 +16,7 @@ from jaxfuzzy.status import Status
 KINDS = search.KINDS
 # A noise distance is so many standard deviations; residuals are searched and weighed in deviations.
 DEVIATIONS = 2.5
+FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
 FEWEST = 12
 CAPACITIES = (256, 512, 1024, 2048)
 
@@ -158,7 +159,7 @@ def _stacked(objects: list[_Object], capacity: int, count: int, dtype: Any) -> d
 class _Fitted(NamedTuple):
     kind: Array
     scores: Array
-    signs: Array
+    detail: Array
     noise: Array
     polished: polish.Polished
 
@@ -173,40 +174,18 @@ def _solve(batch: dict[str, Array], allowed: Array, use_rays: bool) -> _Fitted:
         small = small._replace(gain=small.gain / local)
         found = search.search(small, item["depth_range"].astype(jnp.float32), allowed)
         dtype = view.gain.dtype
-        view = view._replace(gain=view.gain / local.astype(dtype))
-        kind = found.kind
-        take = lambda a: a[kind].astype(dtype)
-        signs = found.signs.astype(dtype)
-        one_, zero = 1.0, 0.0
-        plans = (
-            (rays.plane, (1, 1, 1, 1, 0, 0), True),
-            (lambda t, v: rays.box(t, signs[None], v), None, False),
-            (rays.revolution, (1, 1, 1, 0, 1, 1), False),
-            (rays.revolution, (1, 1, 1, 1, 1, 1), False),
-            (rays.sphere, (1, 1, 1, 1, 0, 0), False),
+        take = lambda a: a[found.kind].astype(dtype)
+        polished = polish.polish(
+            jnp.asarray(FAMILIES)[found.kind],
+            jax.tree.map(take, found.candidates),
+            view._replace(gain=view.gain / local.astype(dtype)),
+            take(found.scale),
+            take(found.background),
+            item["depth_range"],
+            (0.2, 2.0),
+            1e-9 if dtype == jnp.float64 else 1e-5,
         )
-
-        def plan(surface: Any, flags: Any, gauge: bool) -> Any:
-            free = (
-                jnp.concatenate([jnp.ones(1, dtype), jnp.abs(signs), jnp.ones(2, dtype)])
-                if flags is None
-                else jnp.asarray(flags, dtype)
-            )
-            return lambda: polish.polish(
-                surface,
-                free,
-                view,
-                take(found.theta),
-                take(found.scale),
-                take(found.background),
-                item["depth_range"],
-                (0.2, 2.0),
-                1e-9 if dtype == jnp.float64 else 1e-5,
-                gauge,
-            )
-
-        polished = lax.switch(kind, [plan(*p) for p in plans])
-        return _Fitted(kind, found.scores, found.signs, local.astype(dtype), polished)
+        return _Fitted(found.kind, found.scores, take(found.candidates.detail), local.astype(dtype), polished)
 
     return lax.map(one, batch)
 
@@ -231,13 +210,13 @@ def _assemble(
         return build(x).parameters()
 
     def build(x: Array) -> Primitive:
-        e = jnp.concatenate([x[6:].reshape(3, 2), ends[:, 2:]], 1)
-        return bounds.assembled(kind, x[:4], x[4:6], e, signs, rotation, frame)
+        e = jnp.concatenate([x[7:].reshape(3, 2), ends[:, 2:]], 1)
+        return bounds.assembled(kind, x[:5], x[5:7], e, signs, rotation, frame)
 
     x = jnp.concatenate([theta, jnp.zeros(2, theta.dtype), ends[:, :2].ravel()])
     slope = jax.jacfwd(parameters)(x)
-    full = jnp.zeros((12, 12), theta.dtype).at[:6, :6].set(covariance)
-    full = full.at[jnp.arange(6, 12), jnp.arange(6, 12)].set(jnp.repeat(ends[:, 2] ** 2, 2))
+    full = jnp.zeros((13, 13), theta.dtype).at[:7, :7].set(covariance)
+    full = full.at[jnp.arange(7, 13), jnp.arange(7, 13)].set(jnp.repeat(ends[:, 2] ** 2, 2))
     return build(x), slope @ full @ slope.T
 
 
@@ -252,8 +231,8 @@ def _shape(o: _Object, members: np.ndarray, i: int, fitted: _Fitted, kinds: tupl
         status |= Status.TOO_FEW_POINTS
     direction = o.points - o.eye
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    hits = (o.points + polished.depth[:n, None] * direction * bool(np.any(o.eye))) @ np.asarray(polished.rotation).T
-    ends = bounds.ends_of(kind, polished.theta, hits, polished.part[:n], on, fitted.signs[i])
+    hits = (o.points + polished.depth[:n, None] * direction * bool(np.any(o.eye))) @ np.asarray(polished.turn).T
+    ends = bounds.ends_of(kind, polished.theta, hits, polished.part[:n], on, fitted.detail[i])
     if kind == "plane":
         status |= Status.MAY_BE_BOX
     frame = jax.tree.map(lambda a: jnp.asarray(a, dtype), o.frame)
@@ -261,8 +240,8 @@ def _shape(o: _Object, members: np.ndarray, i: int, fitted: _Fitted, kinds: tupl
         kind,
         jnp.asarray(polished.theta),
         jnp.asarray(ends, dtype),
-        jnp.asarray(fitted.signs[i], dtype),
-        jnp.asarray(polished.rotation),
+        jnp.asarray(fitted.detail[i], dtype),
+        jnp.asarray(polished.turn),
         frame,
         jnp.asarray(polished.covariance),
     )

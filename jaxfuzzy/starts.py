@@ -46,6 +46,18 @@ def invert(matrix: Array, right: Array) -> Array:
     return rows[..., size:]
 
 
+def rotation(about_x: Array, about_z: Array) -> Array:
+    """Rotations (..., 3, 3) by the vectors (about_x, 0, about_z): Rodrigues' formula with its limit at no turn."""
+    square = about_x**2 + about_z**2
+    half = 0.5 * jnp.sqrt(square + 1e-30)
+    # sin(angle) / angle and (1 - cos(angle)) / angle².
+    once, twice = jnp.sin(2 * half) / (2 * half), 0.5 * (jnp.sin(half) / half) ** 2
+    x, z = once * about_x, once * about_z
+    xx, zz, xz = twice * about_x**2, twice * about_z**2, twice * about_x * about_z
+    rows = ((1 - zz, -z, xz), (z, 1 - xx - zz, -x), (xz, x, 1 - xx))
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
 def windows(view: View) -> Windows:
     """Fits a plane and three tied bases in every window."""
     x, y, z = (c[0] for c in view.point)
@@ -101,10 +113,10 @@ def windows(view: View) -> Windows:
     round_ = jnp.sqrt(ox**2 + oz**2 + flat)
     narrowing = jnp.clip(-oy[1] / round_[1], -1.5, 1.5)
     return Windows(
-        cylinders=jnp.stack([mx + ox[0], mz + oz[0], round_[0], zero], -1),
-        cones=jnp.stack([mx + ox[1], mz + oz[1], round_[1] + narrowing * my, narrowing], -1),
+        cylinders=jnp.stack([mx + ox[0], mz + oz[0], round_[0], zero, zero], -1),
+        cones=jnp.stack([mx + ox[1], mz + oz[1], round_[1] + narrowing * my, narrowing, zero], -1),
         spheres=jnp.stack(
-            [mx + ox[2], my + oy[2], mz + oz[2], jnp.sqrt(ox[2] ** 2 + oz[2] ** 2 + oy[2] ** 2 + full)], -1
+            [mx + ox[2], my + oy[2], mz + oz[2], jnp.sqrt(ox[2] ** 2 + oz[2] ** 2 + oy[2] ** 2 + full), zero], -1
         ),
         planes=_through(jnp.stack([v[3, :, 1], v[3, :, 3], v[3, :, 2]], -1), jnp.stack([mx, my, mz], -1)),
         middles=jnp.stack([mx, my, mz], -1),
@@ -124,7 +136,7 @@ def front_lines(view: View) -> tuple[Array, Array]:
 
     def lines(narrowing: float) -> Array:
         a, b = anchor[..., 0] + radii * away[..., 0], anchor[..., 2] + radii * away[..., 1]
-        return jnp.stack([a, b, radii + narrowing * anchor[..., 1], 0 * a + narrowing], -1).reshape(-1, 4)
+        return jnp.stack([a, b, radii + narrowing * anchor[..., 1], 0 * a + narrowing, 0 * a], -1).reshape(-1, 5)
 
     return lines(0.0), jnp.concatenate([lines(s) for s in FRONT_NARROWING])
 
@@ -151,23 +163,23 @@ def box_corners(view: View, planes: Array, middles: Array) -> tuple[Array, Array
     c, s = jnp.cos(yaws), jnp.sin(yaws)
     k1 = c * through1[..., 0] + s * through1[..., 2]
     k2 = c * through2[..., 2] - s * through2[..., 0]
-    theta = jnp.stack([yaws, k1, k2, 0 * yaws], -1).reshape(-1, 4)
+    theta = jnp.stack([yaws, k1, k2, 0 * yaws, 0 * yaws], -1).reshape(-1, 5)
     return _signed(theta, view, np.array([1.0, 1.0, 0.0]))
 
 
 def box_tops(view: View, theta: Array, signs: Array) -> tuple[Array, Array]:
     """The same boxes with a top face through each anchor: (B * anchors, 4) and signs."""
     height = view.point[1][0, :BOX_ANCHORS]
-    theta = jnp.broadcast_to(theta[:, None, :], (len(theta), BOX_ANCHORS, 4)).at[:, :, 3].set(height)
+    theta = jnp.broadcast_to(theta[:, None, :], (len(theta), BOX_ANCHORS, 5)).at[:, :, 3].set(height)
     signs = jnp.broadcast_to(signs[:, None, :], (len(signs), BOX_ANCHORS, 3)).at[:, :, 2].set(1.0)
-    return theta.reshape(-1, 4), signs.reshape(-1, 3)
+    return theta.reshape(-1, 5), signs.reshape(-1, 3)
 
 
 def box_ledges(view: View, planes: Array, middles: Array) -> tuple[Array, Array]:
     """Boxes of one upright face, a window's plane, and a top face through each anchor."""
     yaw = jnp.arctan2(planes[:, 2], planes[:, 0])
     k1 = jnp.cos(yaw) * middles[:, 0] + jnp.sin(yaw) * middles[:, 2]
-    theta = jnp.stack([yaw, k1, 0 * k1, 0 * k1], -1)
+    theta = jnp.stack([yaw, k1, 0 * k1, 0 * k1, 0 * k1], -1)
     theta, signs = _signed(theta, view, np.array([1.0, 0.0, 0.0]))
     return box_tops(view, theta, signs)
 
@@ -186,4 +198,5 @@ def _signed(theta: Array, view: View, active: np.ndarray) -> tuple[Array, Array]
 
 def _through(normal: Array, point: Array) -> Array:
     normal = normal * lax.rsqrt((normal**2).sum(-1, keepdims=True) + 1e-12)
-    return jnp.concatenate([normal, (normal * point).sum(-1, keepdims=True)], -1)
+    offset = (normal * point).sum(-1, keepdims=True)
+    return jnp.concatenate([normal, offset, jnp.zeros_like(offset)], -1)
