@@ -44,10 +44,26 @@ def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
         raise ValueError(f"left and right must have the same type, got {images[0].dtype} and {images[1].dtype}")
     if images[0].dtype != np.uint8:
         top = max(float(image.max()) for image in images)
-        images = [(image * (255.0 / max(top, 1e-12)) + 0.5).astype(np.uint8) for image in images]
+        images = [_eight_bits(image, top) for image in images]
     if images[0].ndim != images[1].ndim:
         images = [grey(image) for image in images]
     return images[0], images[1]
+
+
+def read_grey(value: Any, name: str) -> Image:
+    """One image as uint8 (H, W), from a path or an array of any kind that `read_pair` takes.
+
+    Raises:
+        FileNotFoundError: It does not exist.
+        ValueError: It cannot be used.
+        TypeError: It is neither a path nor an array.
+    """
+    image = _image(value, name)
+    return grey(image if image.dtype == np.uint8 else _eight_bits(image, float(image.max())))
+
+
+def _eight_bits(image: np.ndarray, top: float) -> Image:
+    return (image * (255.0 / max(top, 1e-12)) + 0.5).astype(np.uint8)
 
 
 def _image(value: Any, name: str) -> np.ndarray:
