@@ -15,7 +15,7 @@ import trimesh
 from synthetic import AWAY, RIG, RIGHT, UP, bodies, make_scene
 
 import jaxfuzzy
-from jaxfuzzy import drawing, export, report
+from jaxfuzzy import drawing, export, plot, report
 from jaxfuzzy.cloud import read_cloud
 from jaxfuzzy.primitives import Box, Sphere
 from jaxfuzzy.shapes import Shape
@@ -339,6 +339,7 @@ def test_without_the_view_extra(scene, tmp_path, monkeypatch):
     assert not report.can_draw()
     assert set(report.save(scene, tmp_path / "out")) == WRITTEN
     monkeypatch.setitem(sys.modules, "k3d", None)
+    monkeypatch.setattr(plot, "figures", lambda scene: {})
     with pytest.raises(ModuleNotFoundError):
         report.save(scene, tmp_path / "other", view=True)
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
