@@ -15,7 +15,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.alternation import Theta, diagnose, log_sizes_of, step, step_jacobian, strengths_of, sweep
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, is_concrete, record, static
 from jaxfuzzy.memberships import shares
-from jaxfuzzy.solve import Solver, fixed_point
+from jaxfuzzy.solve import Effort, Solver, fixed_point
 from jaxfuzzy.status import Status
 from jaxfuzzy.tiles import Tiles, squared_distances, tile_points
 
@@ -129,18 +129,16 @@ def fcm(
         as_type(m),
         None if given is None else as_type(given),
         None if weights is None else weights.astype(dtype),
-        as_type(solver.tol),
+        solver.traced(dtype),
         mask=None,
         rule=rule,
         sizes=bool(sizes),
         square=is_concrete(m) and float(m) == 2,
         memberships=bool(memberships),
-        max_steps=solver.max_steps,
-        acceleration=solver.acceleration,
     )
 
 
-_STATIC = ("rule", "sizes", "square", "memberships", "max_steps", "acceleration")
+_STATIC = ("rule", "sizes", "square", "memberships")
 
 
 @partial(jax.jit, static_argnames=_STATIC)
@@ -150,15 +148,13 @@ def _fit(
     m: Array,
     noise_distance: Array | None,
     weights: Float[Array, " N"] | None,
-    tol: Array,
+    effort: Effort,
     *,
     mask: Bool[Array, " K"] | None,
     rule: NoiseRule | None,
     sizes: bool,
     square: bool,
     memberships: bool,
-    max_steps: int,
-    acceleration: Literal["anderson"] | None,
 ) -> Partition:
     """The compiled fit; `mask` says which of the seeds are real, the others being pads of a batch over k."""
     chex.assert_rank([points, seeds], 2)
@@ -172,8 +168,7 @@ def _fit(
     # Static flags are bound here; what is traced goes through the arguments.
     short = partial(step, sizes=sizes, square=square, exact=tiles.points.shape[0] == 1)
     smooth = partial(step, sizes=sizes, square=False, exact=True)
-    solver = Solver(max_steps, tol, acceleration)  # type: ignore[arg-type]
-    solve = partial(fixed_point, short, solver=solver, smooth_step=smooth, jacobian=partial(step_jacobian, sizes=sizes))
+    solve = partial(fixed_point, short, solver=effort, smooth_step=smooth, jacobian=partial(step_jacobian, sizes=sizes))
     if rule is not None:
         plain = solve(start, (tiles, m, None, mask))
         noise_distance = _rule_distance(rule, tiles, plain.theta["centers"], mask)

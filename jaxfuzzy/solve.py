@@ -23,7 +23,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, Bool, Float, Int, is_concrete, record
+from jaxfuzzy.arrays import Array, Bool, Float, Int, is_concrete, record, static
 
 # How many past steps Anderson acceleration combines: more brings little on prototypes, which are few.
 MEMORY = 5
@@ -34,7 +34,7 @@ class Solver:
     """How a fixed point is looked for.
 
     Attributes:
-        max_steps: Largest number of steps.
+        max_steps: Largest number of steps, the first one from the seeds included.
         tol: A fit has converged when no prototype moves further than this, in units of the RMS spread of the points; never
             taken below 16 units of rounding. 0 is legal and takes exactly `max_steps` steps.
         acceleration: "anderson" combines the last steps and takes the outcome only where its objective is no higher than that of
@@ -53,6 +53,27 @@ class Solver:
         if is_concrete(self.tol):
             checks.number(self.tol, "tol", at_least=0.0)
         checks.choice(self.acceleration, "acceleration", ("anderson", None))
+
+    def traced(self, dtype: Any) -> "Effort":
+        """The same as values that JAX traces, so that another tolerance or step limit needs no other compilation."""
+        return Effort(
+            jnp.asarray(self.tol, dtype), jnp.asarray(self.max_steps, jnp.int32), self.acceleration is not None
+        )
+
+
+@record
+class Effort:
+    """A solver's settings inside compiled code.
+
+    Attributes:
+        tol: Tolerance.
+        max_steps: Step limit.
+        accelerate: Whether to accelerate.
+    """
+
+    tol: Float[Array, ""]
+    max_steps: Int[Array, ""]
+    accelerate: bool = static()
 
 
 @record
@@ -81,7 +102,7 @@ def fixed_point(
     step: Step,
     start: Any,
     args: Any,
-    solver: Solver,
+    solver: Solver | Effort,
     *,
     smooth_step: Step | None = None,
     jacobian: Jacobian | None = None,
@@ -93,15 +114,14 @@ def fixed_point(
         step: One step; must not close over traced values: what may be differentiated or batched comes through `args`.
         start: Prototypes to start from, a pytree of float arrays in units where the points' RMS spread is 1.
         args: Everything else the step reads: points, weights, fuzzifier, noise distance.
-        solver: Tolerance, step limit, acceleration.
+        solver: Tolerance, step limit, acceleration, as given or already traced.
         smooth_step: The same map in a form that carries every derivative, where `step` takes a short cut; None: `step` itself.
         jacobian: The derivative of the map with respect to the raveled prototypes, at a fixed point; None: by forward
             differentiation of `smooth_step`.
         descent: Whether the step never raises its merit. Where it may, candidates are compared by how far they still move.
     """
     flat, unravel = ravel_pytree(start)
-    tol = jnp.asarray(solver.tol, flat.dtype)
-    accelerate = solver.acceleration is not None
+    effort = solver.traced(flat.dtype) if isinstance(solver, Solver) else solver
 
     def flat_step(y: Array, args: Any, of: Step = step) -> tuple[Array, Array]:
         new, merit = of(unravel(y), args)
@@ -114,71 +134,64 @@ def fixed_point(
 
     smooth = partial(flat_step, of=smooth_step or step)
     y, steps, change, converged = _solve(
-        flat_step, smooth, flat_jacobian, solver.max_steps, accelerate, descent, flat, tol, args
+        flat_step, smooth, flat_jacobian, effort.accelerate, descent, flat, effort.tol, effort.max_steps, args
     )
     return FixedPoint(unravel(y), steps, change, converged)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3, 4, 5))
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3, 4))
 def _solve(
     step: Any,
     smooth: Any,
     jacobian: Any,
-    max_steps: int,
     accelerate: bool,
     descent: bool,
     start: Array,
     tol: Array,
+    max_steps: Array,
     args: Any,
 ) -> tuple[Array, Array, Array, Array]:
     del smooth, jacobian
     eps = jnp.finfo(start.dtype).eps
     # Rounding alone keeps prototypes moving by a few units, so a tolerance below that would never be met.
     limit = jnp.where(tol > 0, jnp.maximum(tol, 16 * eps), -1.0)
-    solution = optx.fixed_point(
-        step,
-        _Alternation(0.0, limit, _largest, accelerate, descent),  # type: ignore[arg-type]
-        start,
-        args,
-        has_aux=True,
-        max_steps=max_steps,
-        throw=False,
-    )
+    solver = _Alternation(0.0, limit, _largest, max_steps, accelerate, descent)  # type: ignore[arg-type]
+    # The step limit is the solver's own, so that it is traced: another limit needs no other compilation.
+    solution = optx.fixed_point(step, solver, start, args, has_aux=True, max_steps=None, throw=False)
     change, y = solution.state.change, solution.state.ahead
     converged = jnp.where(tol > 0, change <= limit, change <= 16 * eps) & jnp.isfinite(y).all()
-    return y, solution.stats["num_steps"].astype(jnp.int32), change, converged
+    return y, solution.state.steps, change, converged
 
 
 def _solve_jvp(
     step: Any,
     smooth: Any,
     jacobian: Any,
-    max_steps: int,
     accelerate: bool,
     descent: bool,
     primals: tuple[Any, ...],
     tangents: tuple[Any, ...],
 ) -> tuple[Any, Any]:
-    start, tol, args = primals
-    y, steps, change, converged = _solve(step, smooth, jacobian, max_steps, accelerate, descent, start, tol, args)
+    start, tol, max_steps, args = primals
+    out = _solve(step, smooth, jacobian, accelerate, descent, start, tol, max_steps, args)
+    y = out[0]
     leaves, treedef = jax.tree.flatten(args)
     together = partial(jax.tree.unflatten, treedef)
-    moving = [not isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents[2])]
+    changes = jax.tree.leaves(tangents[3])
+    moving = [not isinstance(change, SymbolicZero) for change in changes]
 
     def of_moving(parts: list[Array]) -> Array:
         rest = iter(parts)
         return smooth(y, together([next(rest) if on else leaf for on, leaf in zip(moving, leaves, strict=True)]))[0]
 
-    primal = [leaf for on, leaf in zip(moving, leaves, strict=True) if on]
-    tangent = [t for on, t in zip(moving, jax.tree.leaves(tangents[2]), strict=True) if on]
-    if primal:
+    dy = jnp.zeros_like(y)
+    if any(moving):
+        primal = [leaf for on, leaf in zip(moving, leaves, strict=True) if on]
+        tangent = [change for on, change in zip(moving, changes, strict=True) if on]
         forced = jax.jvp(of_moving, (primal,), (tangent,))[1]
-        response = lax.stop_gradient(_pseudo_inverse(jnp.eye(y.size, dtype=y.dtype) - jacobian(y, args)))
-        dy = response @ forced
-    else:
-        dy = jnp.zeros_like(y)
+        response = _pseudo_inverse(jnp.eye(y.size, dtype=y.dtype) - jacobian(y, args))
+        dy = lax.stop_gradient(response) @ forced
     no_tangent = jax.custom_derivatives.zero_from_primal
-    out = (y, steps, change, converged)
     return out, (dy, *(no_tangent(value) for value in out[1:]))
 
 
@@ -196,6 +209,7 @@ def _pseudo_inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
 class _State(eqx.Module):
     """What is carried from step to step beside the prototypes themselves."""
 
+    steps: Int[Array, ""]
     ahead: Float[Array, " p"]  # one step on from the current prototypes
     change: Float[Array, ""]
     moves: Float[Array, "memory p"]  # past differences of prototypes ...
@@ -209,6 +223,7 @@ class _Alternation(optx.AbstractFixedPointSolver):
     rtol: float
     atol: float  # the largest change that counts as standing still
     norm: Callable[[Any], Array] = eqx.field(static=True)
+    max_steps: Int[Array, ""]
     accelerate: bool = eqx.field(static=True)
     descent: bool = eqx.field(static=True)
 
@@ -216,14 +231,15 @@ class _Alternation(optx.AbstractFixedPointSolver):
         del options, f_struct, aux_struct, tags
         ahead, _ = fn(y, args)
         memory = jnp.zeros((MEMORY if self.accelerate else 0, y.size), y.dtype)
-        return _State(ahead, self.norm(ahead - y), memory, memory, jnp.zeros((), jnp.int32))
+        zero = jnp.zeros((), jnp.int32)
+        return _State(zero + 1, ahead, self.norm(ahead - y), memory, memory, zero)
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any) -> tuple[Any, _State, Any]:
         del options, tags
         plain = state.ahead
         if not self.accelerate:
             ahead, merit = fn(plain, args)
-            return plain, _State(ahead, self.norm(ahead - plain), state.moves, state.turns, state.known), merit
+            return plain, _ahead(state, ahead, self.norm(ahead - plain)), merit
         bold = _anderson(y, plain, state)
         ahead, merit = jax.vmap(lambda z: fn(z, args))(jnp.stack([plain, bold]))
         if not self.descent:
@@ -235,12 +251,11 @@ class _Alternation(optx.AbstractFixedPointSolver):
         taught = _remember(state, bold - plain, (ahead[1] - bold) - (ahead[0] - plain))
         state = jax.tree.map(partial(jnp.where, better), taught, state)
         new, ahead = jnp.where(better, bold, plain), jnp.where(better, ahead[1], ahead[0])
-        state = _State(ahead, self.norm(ahead - new), state.moves, state.turns, state.known)
-        return new, state, jnp.where(better, merit[1], merit[0])
+        return new, _ahead(state, ahead, self.norm(ahead - new)), jnp.where(better, merit[1], merit[0])
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, Any]:
         del fn, y, args, options, tags
-        return state.change <= self.atol, optx.RESULTS.successful
+        return (state.change <= self.atol) | (state.steps >= self.max_steps), optx.RESULTS.successful
 
     def postprocess(
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: optx.RESULTS
@@ -255,9 +270,12 @@ def _largest(change: Array) -> Array:
 
 def _remember(state: _State, move: Array, turn: Array) -> _State:
     slot = state.known % MEMORY
-    return _State(
-        state.ahead, state.change, state.moves.at[slot].set(move), state.turns.at[slot].set(turn), state.known + 1
-    )
+    moves, turns = state.moves.at[slot].set(move), state.turns.at[slot].set(turn)
+    return _State(state.steps, state.ahead, state.change, moves, turns, state.known + 1)
+
+
+def _ahead(state: _State, ahead: Array, change: Array) -> _State:
+    return _State(state.steps + 1, ahead, change, state.moves, state.turns, state.known)
 
 
 def _anderson(y: Array, plain: Array, state: _State) -> Array:

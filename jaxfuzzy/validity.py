@@ -15,7 +15,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, Scalar, as_float, is_concrete, record
 from jaxfuzzy.fcm import _STATIC, NoiseRule, Partition, _fit
 from jaxfuzzy.seeding import histogram_seeds
-from jaxfuzzy.solve import Solver
+from jaxfuzzy.solve import Effort, Solver
 
 Index = Literal[
     "vrc", "xie_beni", "partition_coefficient", "modified_partition_coefficient", "fuzzy_silhouette", "jump"
@@ -96,6 +96,8 @@ def choose_k(
     checks.choice(rule, "rule", ("paper", "best"))
     if candidates[0] == 1 and index not in ("jump", "partition_coefficient"):
         raise ValueError(f"ks must not hold 1 for index={index!r}, which cannot score one cluster; index='jump' can")
+    if index == "jump" and candidates != list(range(1, len(candidates) + 1)):
+        raise ValueError(f"ks must be 1, 2, ... without a gap for index='jump', got {tuple(candidates)}")
     checks.fuzzifier(m)
     weights = checks.weights(weights, array.shape[0])
     noise = noise_distance if isinstance(noise_distance, NoiseRule) else checks.noise_distance(noise_distance)
@@ -112,14 +114,12 @@ def choose_k(
         as_type(m),
         None if noise is None or isinstance(noise, NoiseRule) else as_type(noise),
         None if weights is None else weights.astype(array.dtype),
-        as_type(solver.tol),
+        solver.traced(array.dtype),
         index=index,
         rule=noise if isinstance(noise, NoiseRule) else None,
         sizes=bool(sizes),
         square=is_concrete(m) and float(m) == 2,
         memberships=True,
-        max_steps=solver.max_steps,
-        acceleration=solver.acceleration,
     )
     chosen = _pick(np.asarray(scores, float), index, rule)
     k = candidates[chosen]
@@ -148,18 +148,18 @@ def _fit_all(
     m: Array,
     noise_distance: Array | None,
     weights: Array | None,
-    tol: Array,
+    effort: Effort,
     *,
     index: Index,
     **static: object,
 ) -> tuple[Partition, Float[Array, " M"]]:
     def fit(seeds: Array, mask: Array) -> Partition:
-        return _fit(points, seeds, m, noise_distance, weights, tol, mask=mask, **static)
+        return _fit(points, seeds, m, noise_distance, weights, effort, mask=mask, **static)
 
     partitions = jax.vmap(fit)(seeds, mask)
     ks = mask.sum(axis=1)
     if index == "jump":
-        return partitions, _jumps(points, partitions, ks, weights)
+        return partitions, _jumps(points, partitions, weights)
 
     def score(item: tuple[Partition, Array, Array]) -> Array:
         partition, real, k = item
@@ -229,16 +229,15 @@ def _variance_ratio(
     return between / (k - 1) / (within / (count - k))
 
 
-def _jumps(points: Array, partitions: Partition, ks: Array, weights: Array | None) -> Float[Array, " M"]:
-    """Sugar and James (2003): how far the distortion to the power -D/2 jumps at each k; k = 0 counts as zero."""
+def _jumps(points: Array, partitions: Partition, weights: Array | None) -> Float[Array, " M"]:
+    """Sugar and James (2003): how far the distortion to the power -D/2 jumps at each k = 1, 2, ...; at 0 it counts as 0."""
     dims, clusters = points.shape[1], partitions.centers.shape[1]
     within = jax.lax.map(lambda labels: jnp.stack(_within(points, labels, weights, clusters)[::2]), partitions.labels)
     # Relative to the largest distortion, so that no unit overflows the power.
     distortion = within[:, 0] / within[:, 1]
     level = (distortion / distortion.max()) ** (-dims / 2)
     before = jnp.concatenate([jnp.zeros(1, points.dtype), level[:-1]])
-    consecutive = ks == jnp.concatenate([jnp.zeros(1, ks.dtype), ks[:-1]]) + 1
-    return jnp.where(consecutive, level - before, -jnp.inf)
+    return level - before
 
 
 def xie_beni(points: ArrayLike, partition: Partition, *, weights: ArrayLike | None = None) -> Float[Array, ""]:
