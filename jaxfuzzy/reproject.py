@@ -4,6 +4,7 @@ Depth is z = f B / (d + doffs) (`Rig` says what these are), x = (u - cx) z / fx,
 camera's frame. The standard deviation of z follows from that of the disparity, σ_z = z² σ_d / (f B).
 """
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import numpy as np
 
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array
+from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.status import Status
@@ -80,6 +82,68 @@ def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, d
     else:
         std = np.broadcast_to(_std(depth_std, depth, "depth_std"), depth.shape)
     return _cloud(depth, valid, rig, image, std)
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Errors of disparities, measured where the surface is known.
+
+    Attributes:
+        std_px: Standard deviation of a disparity, robust against wrong matches.
+        pixels_per_point: How many neighboring pixels together tell as much as one independent point would: N of them are
+            worth N / pixels_per_point in a covariance or in the price of a parameter.
+    """
+
+    std_px: float
+    pixels_per_point: float
+
+
+def measure_noise(disparity_px: Any, mask: Any, *, truth_px: Any = None, block: int = 32) -> Noise:
+    """Measures the errors of disparities on a plane, or against known disparities.
+
+    A plane in space is a plane in (column, row, disparity), so no calibration is needed. Errors of neighboring pixels are
+    alike over tens of pixels: the mean of a block of b × b varies by far more than 1 / b² of what one pixel does, and the
+    ratio of the two is the number of pixels that make one independent point.
+
+    Args:
+        disparity_px: Disparities (H, W).
+        mask: Pixels of the plane (H, W), or those where the truth is known.
+        truth_px: True disparities (H, W) in place of a plane.
+        block: Side of the blocks, pixels; it must be large against the reach of the correlation.
+
+    Raises:
+        DataError: Fewer than 100 pixels, or fewer than 4 blocks of which half is seen.
+    """
+    values = np.asarray(disparity_px, float)
+    mask = _mask(mask, values.shape) & np.isfinite(values)
+    if mask.sum() < 100:
+        raise DataError(f"mask must hold at least 100 pixels with a disparity, got {int(mask.sum())}")
+    rows, columns = np.nonzero(mask)
+    if truth_px is None:
+        design = np.column_stack([columns - columns.mean(), rows - rows.mean(), np.ones(len(rows))])
+        weight = np.ones(len(rows))
+        for _ in range(
+            30
+        ):  # Geman and McClure's weights, their scale from the median: a third of wrong pixels is no harm
+            root = np.sqrt(weight)[:, None]
+            plane = np.linalg.lstsq(design * root, values[mask] * root[:, 0], rcond=None)[0]
+            error = values[mask] - design @ plane
+            scale = 3 * 1.4826 * np.median(np.abs(error)) + 1e-9
+            weight = 1 / (1 + (error / scale) ** 2) ** 2
+    else:
+        error = values[mask] - np.asarray(truth_px, float)[mask]
+    error = error - np.median(error)
+    std = 1.4826 * float(np.median(np.abs(error)))
+    good = np.abs(error) <= 4 * std
+    number = (rows // block) * (values.shape[1] // block + 1) + columns // block
+    held = np.bincount(number[good])
+    sums = np.bincount(number[good], error[good])
+    full = held >= block**2 / 2
+    if full.sum() < 4:
+        raise DataError(f"mask must cover at least half of 4 blocks of {block} pixels, got {int(full.sum())}")
+    means = sums[full] / held[full]
+    spread = np.sum(held[full] * means**2) / full.sum()
+    return Noise(std, max(1.0, float(spread / np.mean(error[good] ** 2))))
 
 
 def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.ndarray) -> Cloud:

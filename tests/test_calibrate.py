@@ -65,7 +65,7 @@ def assert_known(rig, *, pixels, share):
     assert rig.baseline_m == pytest.approx(np.linalg.norm(TRANSLATION), rel=share)
     # A principal point off by so many pixels is a camera turned by so much.
     np.testing.assert_allclose(rig.rotation, ROTATION, atol=3 * pixels / 560)
-    np.testing.assert_allclose(rig.translation, TRANSLATION, atol=0.002)
+    np.testing.assert_allclose(rig.translation, TRANSLATION, atol=0.001 * pixels)
 
 
 def test_a_known_rig_is_found(odd_board):

@@ -14,7 +14,7 @@ from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.photos import alignment, read_disparity, read_pair, rectify
 from jaxfuzzy.primitives import Sphere
 from jaxfuzzy.render import Setting, paper_scene, render_pair, table_scene
-from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity
+from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity, measure_noise
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.status import Status
 from jaxfuzzy.stereo import disparity, example_pair, reconstruct, search_range
@@ -292,6 +292,43 @@ def test_color_is_matched_too(table):
     assert np.median(np.abs(values - table.disparity_px)[valid]) < 0.06
     cloud = reconstruct(*tinted, table.rig)
     assert cloud.colors.shape == cloud.points.shape
+
+
+# The noise of disparities
+
+
+@pytest.mark.parametrize("reach", [1, 5, 9])
+@pytest.mark.parametrize("known", [False, True])
+def test_noise_of_a_plane_by_construction(reach, known):
+    """White noise averaged over squares of n pixels is correlated over exactly n² of them; a fifth is wrong altogether."""
+    rng = np.random.default_rng(reach)
+    noise = cv2.blur(rng.normal(size=(480, 640)), (reach, reach)) * reach * 0.3
+    columns, rows = np.meshgrid(np.arange(640), np.arange(480))
+    truth = 30 + 0.02 * columns - 0.05 * rows
+    values = truth + noise
+    wrong = rng.uniform(size=values.shape) < 0.2
+    values[wrong] += rng.uniform(-20, 20, wrong.sum())
+    mask = columns > 100
+    found = measure_noise(values, mask, truth_px=truth if known else None)
+    # A fifth of wrong pixels widens the median deviation, and dilutes the correlation of what is left beside it.
+    assert found.std_px == pytest.approx(0.3, rel=0.35)
+    clean = measure_noise(truth + noise, mask, truth_px=truth if known else None)
+    assert clean.std_px == pytest.approx(0.3, rel=0.03)
+    # About 280 blocks: their variance is known to 8 %, and blocks of 32 lose a little of the longest reach at their rim.
+    assert clean.pixels_per_point == pytest.approx(reach**2, rel=0.25)
+    with pytest.raises(DataError, match="at least 100 pixels"):
+        measure_noise(values, mask & (rows < 0))
+    with pytest.raises(DataError, match="half of 4 blocks"):
+        measure_noise(values, (rows < 32) & (columns < 64))
+
+
+def test_noise_of_a_rendered_table_is_that_against_its_truth(table, matched):
+    values, valid = matched
+    mask = valid & (table.labels < 0) & (table.depth_m < 1.79)
+    plane, truth = measure_noise(values, mask), measure_noise(values, mask, truth_px=table.disparity_px)
+    assert plane.std_px == pytest.approx(truth.std_px, rel=0.2)
+    assert plane.pixels_per_point == pytest.approx(truth.pixels_per_point, rel=0.5)
+    assert truth.pixels_per_point > 2, "disparities of neighbors are not independent"
 
 
 # The range of disparities
