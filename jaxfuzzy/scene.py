@@ -1,11 +1,45 @@
 """The pipeline: stereo pair -> cloud -> upright frame -> objects -> shapes. Read this module first."""
 
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, record, static
 from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.ground import fit_ground, foreground
+from jaxfuzzy.matcher import Matcher
+from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
-from jaxfuzzy.segment import Segmentation
-from jaxfuzzy.shapes import Shape
+from jaxfuzzy.segment import Segmentation, segment
+from jaxfuzzy.shapes import Shape, fit_shapes
+from jaxfuzzy.stereo import reconstruct
+
+# Noise distance in standard deviations of a point along its viewing ray: farther points rather belong to noise.
+NOISE_SIGMAS = 2.5
+# The camera's own idea of the vertical, until a supporting plane tells better (OpenCV's y points down).
+CAMERA_UP = (0.0, -1.0, 0.0)
+# How far in radians a supporting plane may lean from a vertical that was given.
+KNOWN_TILT = 0.15
+FEWEST_POINTS = 50
+SEGMENT_OPTIONS = ("ks",)
+SHAPE_OPTIONS = ("kinds", "distance")
+# One word for both choices: how objects are counted, and how shapes are named.
+RULES = {
+    "robust": ("robust", "likelihood"),
+    "likelihood": ("robust", "likelihood"),
+    "gric": ("robust", "gric"),
+    "paper": ("paper", "paper"),
+}
+
+Progress = Callable[[str, float], None]
 
 
 @record
@@ -37,3 +71,203 @@ class Scene:
     image: Array | None = None
     image_right: Array | None = None
     rig: Rig | None = static(default=None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The scene in plain Python, as `scene.json` holds it."""
+        from jaxfuzzy import report
+
+        return report.to_dict(self)
+
+    def save(self, folder: str | Path) -> tuple[str, ...]:
+        """Writes the scene into a folder, all or nothing: data, cloud and models, and the report where it can be drawn.
+
+        Returns:
+            The files written, relative to the folder.
+
+        Raises:
+            OSError: The folder cannot be written.
+        """
+        from jaxfuzzy import report
+
+        return report.save(self, folder)
+
+
+def model_scene(
+    left: Any,
+    right: Any,
+    rig: Rig,
+    *,
+    matcher: Matcher | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Scene:
+    """Models what a stereo pair shows: points, supporting plane, objects, and a primitive for each.
+
+    Args:
+        left: The left image: a path, or a uint8 array, grey (H, W) or BGR (H, W, 3) as `cv2.imread` gives it.
+        right: The right image, of the same size.
+        rig: The cameras.
+        matcher: How to match.
+        progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
+        **options: Those of `model_cloud`.
+
+    Returns:
+        The scene, in the frame of the (rectified) left camera.
+
+    Raises:
+        FileNotFoundError: An image does not exist.
+        ValueError: An image or an option cannot be used, or sizes disagree.
+        DataError: Fewer than 50 pixels were matched, or fewer than 50 points stand above the ground.
+    """
+    _check_options(options)
+    clock = _Clock(progress)
+    with clock.stage("matching"):
+        image, image_right = read_pair(left, right, rig)
+        if not rig.rectified:
+            image, image_right, rig = rectify(image, image_right, rig)
+        cloud = reconstruct(image, image_right, rig, matcher=matcher)
+    scene = _model(cloud, clock, **options)
+    return dataclasses.replace(scene, image=_as_rgb(image), image_right=_as_rgb(image_right), rig=rig)
+
+
+def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: Any) -> Scene:
+    """Models a point cloud: supporting plane, objects, and a primitive for each.
+
+    Args:
+        cloud: The points, in metres.
+        progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
+        **options: `up`: the vertical direction (3,), either sign, or "auto" to take it from the supporting plane.
+            `ground`: "auto" to look for a supporting plane and to leave out what belongs to it; None where the cloud has none,
+            which needs `up`. `camera`: where the points were seen from (3,), the origin by default; None where not known.
+            `ks`: numbers of objects allowed, as in `segment`. `kinds`, `distance`, `noise_distance`, `weights`: as in `fit_shape`.
+            `rule`: "robust" (the default, for objects; "likelihood" is the same), "gric", or "paper" for the paper's own rules
+            throughout.
+
+    Raises:
+        ValueError: An option cannot be used.
+        TypeError: An unknown option.
+        DataError: Fewer than 50 points stand above the ground.
+    """
+    _check_options(options)
+    return _model(cloud, _Clock(progress), **options)
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    known = ("up", "ground", "camera", "rule", "noise_distance", "weights", *SEGMENT_OPTIONS, *SHAPE_OPTIONS)
+    for name in options:
+        if name not in known:
+            raise TypeError(f"unknown option {name!r}: allowed are {', '.join(known)}")
+    checks.choice(options.get("rule", "robust"), "rule", RULES)
+    ground, up = options.get("ground", "auto"), options.get("up", "auto")
+    if ground is not None:
+        checks.choice(ground, "ground", ("auto",))
+    elif isinstance(up, str):
+        raise ValueError("up must be given as (x, y, z) where ground=None: there is no plane to take it from")
+    if isinstance(up, str):
+        checks.choice(up, "up", ("auto",))
+    else:
+        checks.direction(up, "up")
+
+
+def _model(
+    cloud: Cloud,
+    clock: "_Clock",
+    *,
+    up: Any = "auto",
+    ground: str | None = "auto",
+    camera: Any = (0.0, 0.0, 0.0),
+    rule: str = "robust",
+    noise_distance: Any = "auto",
+    weights: Any = None,
+    **options: Any,
+) -> Scene:
+    points = checks.points(cloud.points, "cloud.points", dims=3)
+    count = points.shape[0]
+    vertical = CAMERA_UP if isinstance(up, str) else checks.direction(up, "up")
+    known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
+    heaviness = checks.weights(weights, count)
+    deviation, plane, status = cloud.depth_std, None, int(cloud.status)
+    kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
+    with clock.stage("ground"):
+        if ground is not None:
+            found = fit_ground(
+                points, up=vertical, weights=heaviness, depth_std=cloud.depth_std, camera=camera, **known_up
+            )
+            kept &= np.asarray(foreground(points, found, up=vertical, weights=heaviness, camera=camera).mask)
+            plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
+            vertical = vertical if plane is None else np.asarray(plane.normal)
+    if isinstance(noise_distance, str) and deviation is not None:
+        noise_distance = NOISE_SIGMAS * deviation
+    segment_rule, shape_rule = RULES[rule]
+    own = np.flatnonzero(kept)
+    noise = noise_distance if np.ndim(noise_distance) == 0 else jnp.asarray(noise_distance)[own]
+    seen = {"up": vertical, "camera": camera, "noise_distance": noise}
+    own_weights = None if heaviness is None else heaviness[own]
+    with clock.stage("objects"):
+        if len(own) < FEWEST_POINTS:
+            raise checks.DataError(
+                f"only {len(own)} of {count} points stand above the ground, {FEWEST_POINTS} are needed"
+            )
+        picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
+        parts = segment(points[own], rule=segment_rule, weights=own_weights, **seen, **picked)
+    with clock.stage("shapes"):
+        picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
+        shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, weights=own_weights, **seen, **picked)
+    labels = np.full(count, -1, np.int32)
+    labels[own] = parts.labels
+    settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
+    return Scene(
+        cloud=cloud,
+        up=jnp.asarray(vertical, points.dtype),
+        ground=plane,
+        segmentation=dataclasses.replace(parts, labels=jnp.asarray(labels)),
+        shapes=shapes,
+        timings=clock.seconds,
+        settings={name: _plain(value) for name, value in (settings | options).items()},
+        status=jnp.asarray(status | int(parts.status), jnp.int32),
+    )
+
+
+def load_scene(folder: str | Path) -> Scene:
+    """Reads back what `Scene.save` wrote.
+
+    Raises:
+        FileNotFoundError: There is no such folder or no scene in it.
+        ValueError: The files are damaged or of another version.
+    """
+    from jaxfuzzy import report
+
+    return report.load(folder)
+
+
+def _told(noise_distance: Any) -> Any:
+    """A noise distance as the settings tell it: the median where every point has its own."""
+    return noise_distance if np.ndim(noise_distance) == 0 else float(np.median(np.asarray(noise_distance)))
+
+
+def _plain(value: Any) -> Any:
+    """A setting in plain Python."""
+    return np.asarray(value).tolist() if hasattr(value, "shape") else value
+
+
+def _as_rgb(image: np.ndarray) -> Array:
+    return jnp.asarray(image[..., ::-1] if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2))
+
+
+class _Clock:
+    """Times the stages and tells how far the work has come."""
+
+    # Shares of the work done before each stage, as measured on the bundled pair.
+    begins: dict[str, float] = {"matching": 0.0, "ground": 0.1, "objects": 0.4, "shapes": 0.6}  # noqa: RUF012
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        if self.progress is not None:
+            self.progress(name, self.begins[name])
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
