@@ -123,7 +123,7 @@ def _cluster(args: argparse.Namespace) -> int:
     from jaxfuzzy.validity import choose_k
 
     if args.out is not None:
-        table.check_suffix(args.out)
+        table.check_target(args.out)
         if args.out.exists() and args.out.samefile(args.points):
             raise ValueError(f"out must not be the input, got {args.out}")
     names, points = table.read_points(args.points, args.columns)
@@ -139,8 +139,9 @@ def _cluster(args: argparse.Namespace) -> int:
             k = int(chosen.k)
             scores = {int(one): float(score) for one, score in zip(chosen.ks, chosen.scores, strict=True)}
         progress("fitting", 0.5 if scores else 0.0)
-        seeds = histogram_seeds(points, k).centers
-        partition = fcm(points, seeds, m=args.m, sizes=args.sizes, noise_distance=args.noise_distance)
+        partition = fcm(points, histogram_seeds(points, k).centers, m=args.m, noise_distance=args.noise_distance)
+        if args.sizes:  # from a fit without sizes: started from the seeds alone, sizes follow a poor seed
+            partition = fcm(points, partition.centers, m=args.m, noise_distance=args.noise_distance, sizes=True)
         if args.out is not None:
             progress("writing", 0.9)
             table.write_points(args.out, names, points, partition)
@@ -198,11 +199,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     from jaxfuzzy.calibrate import calibrate
     from jaxfuzzy.rig import save_rig
 
-    if len(args.left) != len(args.right):
-        raise ValueError(f"left and right must be as many images, got {len(args.left)} and {len(args.right)}")
     with Progress(args.quiet) as progress:
         progress("looking for the board", 0.0)
-        rig = calibrate(args.left, args.right, board=args.board, square_m=args.square)
+        rig = calibrate(args.left, args.right, board=args.board, square_m=args.square, marker_m=args.marker)
         save_rig(args.out, rig)
     if args.json:
         show(json.dumps(dataclasses.asdict(rig), allow_nan=False))

@@ -116,6 +116,13 @@ def size_text(shape: Shape, *, metric: bool = True) -> str:
     return ", ".join(f"{m.name} {measure_text(m, metric=metric)}" for m in measures(shape))
 
 
+def score_text(score: float | None) -> str:
+    """A score in words; a dash for a kind that could not be fitted."""
+    if score is None or not math.isfinite(score):
+        return "–"
+    return f"{score:,.0f}" if abs(score) >= 1000 else f"{score:.4g}"
+
+
 def position(shape: Shape) -> np.ndarray | None:
     """A point (3,) to say where a shape is: the middle of its body; None where unknown."""
     body = shape.primitive

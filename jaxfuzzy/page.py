@@ -25,6 +25,8 @@ DATA = Path(__file__).parent / "data"
 # More points make the page large, a wider photograph too; the page says where it shows fewer.
 POINTS_SHOWN = 60_000
 PHOTOGRAPH_WIDTH = 1200
+# The parameters that say where a shape is.
+PLACES = ("point", "center", "base", "apex")
 # The photograph with outlines and the score tables stand on the page already.
 LEFT_OUT = ("overlay", "scores")
 
@@ -88,7 +90,7 @@ def viewer(scene: "Scene", kept: slice) -> str:
     cloud = k3d.points(
         places,
         colors=tones.astype(np.uint32),
-        point_size=_spacing(scene) * math.sqrt(kept.step),
+        point_size=0.8 * _spacing(scene) * math.sqrt(kept.step),
         shader="flat",
         name="points",
         compression_level=9,
@@ -103,7 +105,7 @@ def viewer(scene: "Scene", kept: slice) -> str:
             (vertices @ turn).astype(np.float32),
             faces.astype(np.uint32),
             color=_hex(index),
-            opacity=0.6,
+            opacity=0.75,
             side="double",
             flat_shading=False,
             name=drawing.name(index, shape),
@@ -114,8 +116,8 @@ def viewer(scene: "Scene", kept: slice) -> str:
         low, high = np.minimum(low, (vertices @ turn).min(0)), np.maximum(high, (vertices @ turn).max(0))
     focus, reach = (low + high) / 2, float(np.linalg.norm(high - low))
     views = {
-        "front": [*(focus + reach * np.array([0.0, -0.75, 0.45])), *focus, 0, 0, 1],
-        "above": [*(focus + reach * np.array([0.0, -0.01, 0.95])), *focus, 0, 0, 1],
+        "front": [*(focus + reach * np.array([0.0, -0.7, 0.4])), *focus, 0, 0, 1],
+        "above": [*(focus + reach * np.array([0.0, -0.01, 0.8])), *focus, 0, 0, 1],
     }
     meta = {"models": models, "clouds": [cloud.id]} | {name: [float(v) for v in view] for name, view in views.items()}
     plot.camera = meta["front"]
@@ -186,13 +188,15 @@ def _details(entry: Mapping[str, Any], metric: bool) -> str:
     length = Measure("noise distance", entry["noise_distance"], None)
     facts.append((length.name, drawing.measure_text(length, metric=metric)))
     for name, value in (entry["parameters"] or {}).items():
-        if name not in ("radius", "half_angle", "size", "seen", "corners", "bounds"):
+        if name in PLACES:
+            facts.append((name, _numbers(value) + (" m" if metric else "")))
+        elif name in ("axis", "axes", "normal", "coefficients"):
             facts.append((name, _numbers(value)))
     notes = "".join(f'<p class="note">{_text(reason)}</p>' for reason in entry["reasons"])
     ranked = sorted(entry["scores"].items(), key=lambda item: math.inf if item[1] is None else item[1])
     scores = "".join(
         f'<tr class="{"chosen" if kind == entry["kind"] else ""}"><th scope="row">{_text(kind)}</th>'
-        f'<td class="number">{"–" if score is None else f"{score:.4g}"}</td></tr>'
+        f'<td class="number">{drawing.score_text(score)}</td></tr>'
         for kind, score in ranked
     )
     table = (
@@ -258,7 +262,7 @@ def _spacing(scene: "Scene") -> float:
     """About the distance between neighbouring points: one pixel's width where there is a camera."""
     points = np.asarray(scene.cloud.points, float)
     if scene.rig is not None:
-        return 1.2 * float(np.median(points[:, 2])) / scene.rig.focal_px[0]
+        return float(np.median(points[:, 2])) / scene.rig.focal_px[0]
     low, high = np.percentile(points, [1, 99], axis=0)
     return float(np.linalg.norm(high - low)) / math.sqrt(len(points))
 

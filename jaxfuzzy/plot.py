@@ -28,7 +28,7 @@ FIGURES = {
     "pca": "The objects from above with their principal axes (figure 5)",
     "histogram": "Histogram along the first principal axis, and the seeds it gives (figure 6)",
     "vrc": "Variance ratio over the number of clusters, and the paper's choice (figure 7)",
-    "fcm_sizes": "Fuzzy c-means with sizes, started from these seeds (figure 8)",
+    "fcm_sizes": "Fuzzy c-means with sizes for that number (figure 8)",
     "nfcv": "Points on each surface, and noise (figure 9)",
     "models": "The shapes found (figure 10)",
     "overlay": "Outlines of the shapes over the photograph",
@@ -146,7 +146,7 @@ def inliers(
     *,
     up: Float[ArrayLike, "3"] = (0.0, -1.0, 0.0),
 ) -> Any:
-    """The objects in 3D: points on their surface in the object's color, points that the noise cluster took as crosses."""
+    """The objects in 3D: points on their surface in the object's color, noise as crosses; shares of points on the surface."""
     ax = _axes(ax, (7, 6), projection="3d")
     places, owner = np.asarray(points, float) @ drawing.upright_frame(up).T, np.asarray(labels)
     inside = np.zeros(len(places), bool)
@@ -158,12 +158,12 @@ def inliers(
     tones = [drawing.rgb(i) for i in owner[good]]
     ax.scatter(*places[good].T, c=tones, s=3, depthshade=False, linewidths=0)
     label = f"noise: {len(own) - int(inside.sum())} of {len(own)} points"
-    ax.scatter(*places[bad].T, c="black", s=9, marker="x", linewidths=0.6, depthshade=False, label=label)
+    ax.scatter(*places[bad].T, c="black", s=4, marker="x", linewidths=0.3, depthshade=False, label=label)
     for i, shape in enumerate(shapes):
         body = places[owner == i]
         if len(body):
-            share = f"{int(np.sum(np.asarray(shape.inliers)))}/{len(body)}"
-            ax.text(*body.mean(0)[:2], body[:, 2].max(), f"{i}: {share}", fontsize=8, bbox=_LABEL, zorder=10)
+            share = 100 * np.mean(np.asarray(shape.inliers))
+            ax.text(*body.mean(0)[:2], body[:, 2].max(), f"{i}: {share:.0f} %", fontsize=8, bbox=_LABEL, zorder=10)
     ax.legend(frameon=False, loc="upper left")
     _view(ax, places[drawn])
     return ax
@@ -244,7 +244,7 @@ def score_table(shapes: tuple[Shape, ...], ax: Any = None) -> Any:
     if not kinds:
         ax.text(0.5, 0.5, "no object was scored", ha="center", va="center", transform=ax.transAxes)
         return ax
-    text = [[_score(shape.scores.get(kind)) for kind in kinds] for shape in shapes]
+    text = [[drawing.score_text(shape.scores.get(kind)) for kind in kinds] for shape in shapes]
     table = ax.table(text, rowLabels=[drawing.name(i, s) for i, s in enumerate(shapes)], colLabels=kinds, loc="center")
     table.auto_set_font_size(False)
     table.set_fontsize(9)
@@ -307,7 +307,7 @@ def paper_stages(scene: "Scene") -> PaperStages | None:
     flat = plan(points, scene.up)
     count = choose_k(flat, PAPER_KS, index="vrc", rule="paper")
     seeds = histogram_seeds(flat, int(count.k))
-    return PaperStages(flat, seeds, count, fcm(flat, seeds.centers, sizes=True))
+    return PaperStages(flat, seeds, count, fcm(flat, count.partition.centers, sizes=True))
 
 
 def plan(points: Float[ArrayLike, "N 3"], up: Float[ArrayLike, "3"]) -> np.ndarray:
@@ -365,10 +365,6 @@ def _plan_view(ax: Any) -> Any:
 def _bare(ax: Any) -> Any:
     ax.spines[["top", "right"]].set_visible(False)
     return ax
-
-
-def _score(value: float | None) -> str:
-    return "–" if value is None or not np.isfinite(value) else f"{value:.4g}"
 
 
 def _subscript(number: int) -> str:

@@ -183,8 +183,8 @@ def load(folder: str | os.PathLike[str]) -> "Scene":
             timings=tree["timings"],
             settings=tree["settings"],
             status=jnp.asarray(tree["status"]),
-            image=_restore(np.ndarray, arrays, "image"),
-            image_right=_restore(np.ndarray, arrays, "image_right"),
+            image=_restore(jax.Array, arrays, "image"),
+            image_right=_restore(jax.Array, arrays, "image_right"),
             rig=load_rig(folder / "rig.json") if "rig.json" in tree["files"] else None,
         )
     except (KeyError, TypeError, AttributeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
@@ -261,7 +261,7 @@ def _restore(kind: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
         return None
     if kind is int:
         return int(arrays[name])
-    return arrays[name] if kind is np.ndarray else jnp.asarray(arrays[name])
+    return jnp.asarray(arrays[name])
 
 
 def _cast(body: Any, dtype: Any) -> Any:

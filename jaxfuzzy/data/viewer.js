@@ -15,7 +15,7 @@ function select(index) {
   for (const [id, number] of Object.entries(META.models)) {
     const mesh = object(id);
     if (!mesh) continue;
-    mesh.material.opacity = index === null ? 0.6 : number === index ? 0.95 : 0.2;
+    mesh.material.opacity = index === null ? 0.75 : number === index ? 1 : 0.25;
     mesh.material.needsUpdate = true;
   }
   K3DInstance.render();
