@@ -244,7 +244,8 @@ def first(peers: Peers) -> dict[str, object]:
     del peers
     code = (
         "import time; t = time.perf_counter(); import numpy as np, jaxfuzzy as jf;"
-        "x = np.random.default_rng(0).normal(size=(20000, 3)).astype('f'); jf.fcm(x, x[:4]).centers.block_until_ready(); print(time.perf_counter() - t)"
+        "x = np.random.default_rng(0).normal(size=(20000, 3)).astype('f'); jf.fcm(x, x[:4]).centers.block_until_ready();"
+        "print(time.perf_counter() - t)"
     )
     rows = {}
     with tempfile.TemporaryDirectory() as cache:
