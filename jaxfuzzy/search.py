@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfuzzy import choice, rays, starts
+from jaxfuzzy import choice, local, rays, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.rays import Residual, View
 
@@ -19,6 +19,7 @@ KINDS = ("plane", "box", "cylinder", "cone", "sphere")
 FEW, MORE = 256, 768
 # How many of each kind are moved on a few points.
 KEPT = 6
+PATCHES = 24
 SCREEN = 2.0
 COARSE = tuple(np.geomspace(4.0, 2.5, 6))
 FINE = tuple(np.geomspace(3.0, 2.5, 5))
@@ -116,6 +117,7 @@ class Found(NamedTuple):
         candidates: The best candidate of each kind.
         scale: Noise scale of each.
         background: Share of background of each.
+        deviation: What the points' deviations were found to be, in units of 1 / gain; 1 where given.
     """
 
     kind: Array
@@ -123,18 +125,37 @@ class Found(NamedTuple):
     candidates: Candidates
     scale: Array
     background: Array
+    deviation: Array
 
 
-def search(view: View, depth_range: Array, allowed: Array) -> Found:
-    """Finds the best surface of each kind and chooses among the allowed ones (5,)."""
+def search(view: View, depth_range: Array, allowed: Array, given: Array) -> Found:
+    """Finds the best surface of each kind and chooses among the allowed ones (5,).
+
+    Args:
+        view: All points; where `given` is false, gains are right but for a common factor, which is found here.
+        depth_range: Range of depth over which background is spread.
+        allowed: Which kinds may be chosen (5,).
+        given: Whether the deviation of the points is known.
+    """
     dtype = view.gain.dtype
-    few, more = rays.taken(view, FEW), rays.taken(view, MORE)
-    coarse = _screened(few)
+    few = rays.taken(view, FEW)
+    company = starts.dense(few)
+    anchors = jnp.stack([c[0] for c in few.point], -1)[starts.first_of(company, starts.ANCHORS)]
+    patches = local.patches(rays.taken(view, MORE), anchors[:PATCHES])
+    deviation = jnp.where(given, 1.0, jnp.maximum(local.typical_deviation(patches), 1e-6))
+    view = view._replace(gain=view.gain / deviation)
+    turn = local.lean(view, patches)
+    few, more = rays.turned(rays.taken(view, FEW), turn[None]), rays.taken(view, MORE)
+    level, on_lid = _lid(few, patches, turn, company)
+    under = company & (few.point[1][0] < jnp.where(jnp.isnan(level), jnp.inf, level)) & ~on_lid
+    window = starts.windows(few, anchors @ turn.T, under.astype(dtype))
+    coarse = _screened(few, window, company)
     counts = (KEPT, KEPT + KEPT // 2, len(coarse.theta) - 3 * KEPT - KEPT // 2, KEPT)
     coarse, price = descend(coarse, counts, few, COARSE, 0.5, False, False)
-    fine, counts = _finalists(coarse, price, counts, few)
-    fine, _ = descend(fine, counts, more, FINE, 0.2, True, True)
-    r = residuals(fine, counts, rays.turned(more, fine.turn), True)
+    fine, counts = _finalists(coarse, price, counts, few, window, company, turn, level, on_lid)
+    lids = view.ray is not None
+    fine, _ = descend(fine, counts, more, FINE, 0.2, True, lids)
+    r = residuals(fine, counts, rays.turned(more, fine.turn), lids)
     mixed = choice.mixture(r, more, depth_range, (0.35, 1.6))
     count = more.mask.sum()
     score = -mixed.log_likelihood + 0.5 * fine.free.sum(-1) * jnp.log(count)
@@ -164,7 +185,12 @@ def search(view: View, depth_range: Array, allowed: Array) -> Found:
     scores = jnp.where(allowed, table.min(-1), jnp.inf)
     chosen = Candidates(*(c[best] for c in fine))
     return Found(
-        jnp.argmin(scores), scores * view.mask.sum() / count, chosen, mixed.scale[best], mixed.background[best]
+        jnp.argmin(scores),
+        scores * view.mask.sum() / count,
+        chosen,
+        mixed.scale[best],
+        mixed.background[best],
+        deviation,
     )
 
 
@@ -180,25 +206,33 @@ def _absurd(radius: Array) -> Array:
     return jnp.where((radius > 4) | (radius < 0.02) | ~jnp.isfinite(radius), jnp.inf, 0.0)
 
 
-def _screened(few: View) -> Candidates:
+def _screened(few: View, window: starts.Windows, company: Array) -> Candidates:
     """The best starts of each family."""
     price = lambda r: choice.cost(r, few.mask, SCREEN)
     dtype = few.gain.dtype
-    window = starts.windows(few)
-    line_cylinders, line_cones = starts.front_lines(few)
+    line_cylinders, line_cones = starts.front_lines(few, starts.first_of(company, starts.FRONT_ANCHORS))
     cylinders = jnp.concatenate([window.cylinders, line_cylinders])
     cones = jnp.concatenate([window.cones, line_cones])
     both = jnp.concatenate([cylinders, cones])
     cost = price(rays.revolution(both, None, few)) + _absurd(both[:, 2])
-    cylinders = cylinders[_best(cost[: len(cylinders)], KEPT)]
-    cones = cones[_best(cost[len(cylinders) :][-len(cones) :], KEPT)]
+    n = len(cylinders)
+    cylinders = cylinders[_best(cost[:n], KEPT)]
+    cones = cones[_best(cost[n:], KEPT)]
     sloped = [cylinders[:4].at[:, 3].set(s) for s in (0.0, 0.3, 0.7)]
     spheres = window.spheres[_best(price(rays.sphere(window.spheres, few)) + _absurd(window.spheres[:, 3]), KEPT)]
     cost = price(rays.plane(window.planes, few))
     planes = window.planes[_best(cost, KEPT)]
-    upright = _best(jnp.where(jnp.abs(window.planes[:, 1]) < 0.5, cost, jnp.inf), starts.BOX_PLANES)
-    corner, corner_signs = starts.box_corners(few, window.planes[upright], window.middles[upright])
-    ledge, ledge_signs = starts.box_ledges(few, window.planes[upright], window.middles[upright])
+    # Upright planes: the two best, and the best that look another way.
+    normal = window.planes[:, :3]
+    cost = jnp.where(jnp.abs(normal[:, 1]) < 0.5, cost, jnp.inf)
+    first = jnp.argmin(cost)
+    upright = _best(cost + jnp.where(jnp.abs(normal @ normal[first]) < 0.95, 0.0, 1e6), starts.BOX_PLANES - 2)
+    upright = jnp.concatenate([_best(cost, 2), upright])
+    off = rays.plane(window.planes[first][None], few)
+    chosen = starts.first_of(company & (jnp.abs(off.error[0]) > 3), starts.BOX_ANCHORS)
+    anchor = jnp.stack([c[0][chosen] for c in few.point], -1)
+    corner, corner_signs = starts.box_corners(few, anchor, window.planes[upright], window.middles[upright])
+    ledge, ledge_signs = starts.box_ledges(few, anchor[:, 1], window.planes[upright], window.middles[upright])
     i = _best(price(rays.box(corner, corner_signs, few)), KEPT)
     j = _best(price(rays.box(ledge, ledge_signs, few)), KEPT // 2)
     bodies = jnp.concatenate([cylinders, cones, *sloped])
@@ -224,8 +258,58 @@ def _box_flags(signs: Array) -> Array:
     return jnp.concatenate([ones, jnp.abs(signs), 0 * ones, ones, ones], 1)
 
 
+def _ended(theta: Array, ends: int, rim: Array, turn: Array, cone: Array) -> Candidates:
+    """Bodies of revolution with a kind of end."""
+    one = jnp.ones_like(rim)
+    detail = jnp.stack([ends * one, rim, 0 * one], -1)
+    moves = one if ends == rays.CLOSED else 0 * one
+    free = jnp.stack([one, one, one, cone * one, moves, one, one], -1)
+    return Candidates(theta, detail, free, jnp.broadcast_to(turn, (len(theta), 3, 3)))
+
+
+def _vessels(theta: Array, cone: Array, few: View, height: Array, turn: Array) -> list[Candidates]:
+    """The best lid and the best open rim for each of a few sides."""
+    found = []
+    for ends in (rays.CLOSED, rays.OPEN):
+        level = jnp.tile(height, (len(theta), 1))
+        level = level.ravel()
+        many = jnp.repeat(theta, len(height), axis=0)
+        many = many.at[:, 4].set(level if ends == rays.CLOSED else height.min())
+        trial = _ended(many, ends, level, turn, jnp.zeros_like(level))
+        cost = choice.cost(rays.revolution(many, trial.detail, few), few.mask, SCREEN).reshape(len(theta), -1)
+        best = jnp.argmin(cost, -1) + jnp.arange(len(theta)) * len(height)
+        found.append(_ended(many[best], ends, level[best], turn, cone))
+    return found
+
+
+def _lid(few: View, patches: local.Patches, turn: Array, company: Array) -> tuple[Array, Array]:
+    """Height of a lid, NaN where no small piece of surface is level, and the points on it."""
+    normal, middle = patches.normal @ turn.T, patches.middle @ turn.T
+    flat = jnp.where((jnp.abs(normal[:, 1]) > 0.9) & patches.usable, middle[:, 1], jnp.nan)
+    return starts.lid_level(few, flat, company, 3.0)
+
+
+def _lidded(few: View, window: starts.Windows, turn: Array, level: Array, on_lid: Array) -> list[Candidates]:
+    """A cylinder and a cone under a lid."""
+    below = jnp.stack([window.cylinders[-1], window.cones[-1]])
+    theta = starts.lid_bodies(few, below, jnp.where(jnp.isnan(level), 1e3, level), on_lid)
+    straight = theta[:, 3] == 0
+    trial = _ended(theta, rays.CLOSED, theta[:, 4], turn, ~straight)
+    cost = choice.cost(rays.revolution(theta, trial.detail, few), few.mask, 2 * SCREEN) + _absurd(theta[:, 2])
+    pick = lambda kept: jnp.argmin(jnp.where(kept, cost, jnp.inf))[None]
+    return [Candidates(*(c[pick(kept)] for c in trial)) for kept in (straight, ~straight)]
+
+
 def _finalists(
-    coarse: Candidates, cost: Array, counts: tuple[int, ...], few: View
+    coarse: Candidates,
+    cost: Array,
+    counts: tuple[int, ...],
+    few: View,
+    window: starts.Windows,
+    company: Array,
+    turn: Array,
+    level: Array,
+    on_lid: Array,
 ) -> tuple[Candidates, tuple[int, int, int, int]]:
     """The best two of each kind, the best boxes with a top, the best bodies of revolution with a lid or open."""
     p, b, n, _ = np.cumsum(counts)
@@ -236,9 +320,10 @@ def _finalists(
     cylinders = b + _best(cost[b : b + k], 2)
     cones = b + k + _best(cost[b + k : n], 2)
     spheres = n + _best(cost[n:], 2)
-    take = lambda i: Candidates(*(c[i] for c in coarse))
+    take = lambda i: Candidates(*(c[i] for c in coarse))._replace(turn=jnp.broadcast_to(turn, (len(i), 3, 3)))
+    height = few.point[1][0][starts.first_of(company, starts.BOX_ANCHORS)]
     corner = take(corners)
-    tops, signs = starts.box_tops(few, corner.theta, corner.detail)
+    tops, signs = starts.box_tops(height, corner.theta, corner.detail)
     i = _best(choice.cost(rays.box(tops, signs, few), few.mask, SCREEN), 2)
     tops, signs = tops[i], signs[i]
     topped = Candidates(tops, signs, _box_flags(signs), corner.turn[:2])
@@ -246,6 +331,18 @@ def _finalists(
     bodies = bodies._replace(
         detail=jnp.broadcast_to(jnp.array([rays.SIDE, 1e3, 0.0]), bodies.detail.shape).astype(few.gain.dtype)
     )
-    groups = [take(planes), take(corners[:2]), take(ledges), topped, bodies, take(spheres)]
-    sizes = (2, 5, 4, 2)
+    ended = []
+    if few.ray is not None:
+        # The best sides, and the cone that looks best from within.
+        within = window.cones.at[:, 4].set(height.min())
+        top = jnp.full(len(within), height.max())
+        looked = _ended(within, rays.OPEN, top, turn, top)
+        cost = choice.cost(rays.revolution(within, looked.detail, few), few.mask, SCREEN) + _absurd(within[:, 2])
+        sides = jnp.stack([coarse.theta[cylinders[0]], coarse.theta[cones[0]], within[jnp.argmin(cost)]])
+        ended = [
+            *_vessels(sides, jnp.array([0.0, 1.0, 1.0], few.gain.dtype), few, height, turn),
+            *_lidded(few, window, turn, level, on_lid),
+        ]
+    groups = [take(planes), take(corners[:2]), take(ledges), topped, bodies, *ended, take(spheres)]
+    sizes = (2, 5, 4 + sum(len(e.theta) for e in ended), 2)
     return Candidates(*(jnp.concatenate(c) for c in zip(*groups, strict=True))), sizes

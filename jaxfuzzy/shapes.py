@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfuzzy import bounds, checks, noise, polish, rays, search
+from jaxfuzzy import bounds, checks, polish, rays, search
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, as_float, record, static
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.status import Status
@@ -169,23 +169,21 @@ def _solve(batch: dict[str, Array], allowed: Array, use_rays: bool) -> _Fitted:
     def one(item: dict[str, Array]) -> _Fitted:
         view = _view(item, use_rays)
         small = jax.tree.map(lambda a: a.astype(jnp.float32), view)
-        local = noise.local_deviation(rays.taken(small, search.MORE))
-        local = jnp.where(item["given"], 1.0, jnp.maximum(local, 1e-6))
-        small = small._replace(gain=small.gain / local)
-        found = search.search(small, item["depth_range"].astype(jnp.float32), allowed)
+        found = search.search(small, item["depth_range"].astype(jnp.float32), allowed, item["given"])
         dtype = view.gain.dtype
+        deviation = found.deviation.astype(dtype)
         take = lambda a: a[found.kind].astype(dtype)
         polished = polish.polish(
             jnp.asarray(FAMILIES)[found.kind],
             jax.tree.map(take, found.candidates),
-            view._replace(gain=view.gain / local.astype(dtype)),
+            view._replace(gain=view.gain / deviation),
             take(found.scale),
             take(found.background),
             item["depth_range"],
             (0.2, 2.0),
             1e-9 if dtype == jnp.float64 else 1e-5,
         )
-        return _Fitted(found.kind, found.scores, take(found.candidates.detail), local.astype(dtype), polished)
+        return _Fitted(found.kind, found.scores, take(found.candidates.detail), deviation, polished)
 
     return lax.map(one, batch)
 

@@ -19,10 +19,12 @@ from jaxfuzzy.arrays import Array
 from jaxfuzzy.rays import View
 
 ANCHORS = 32
+COMPANY = 0.2
 WIDTHS = (0.25, 0.5, 1.0)
 POWER_STEPS = 8
 FRONT_ANCHORS, FRONT_RADII, FRONT_NARROWING = 24, (0.2, 0.35, 0.55, 0.8, 1.1), (0.25, 0.6)
 BOX_ANCHORS, BOX_PLANES, BOX_YAWS = 24, 6, 10
+LID_RADII, LID_NARROWING = (0.85, 0.92, 1.0, 1.08), (0.0, 0.25, -0.25, 0.5, -0.5)
 
 
 class Windows(NamedTuple):
@@ -58,13 +60,26 @@ def rotation(about_x: Array, about_z: Array) -> Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-def windows(view: View) -> Windows:
-    """Fits a plane and three tied bases in every window."""
+def dense(view: View) -> Array:
+    """Which points have company: local density above a fifth of the largest. Uniform outliers have little (N,)."""
+    point = jnp.stack([c[0] for c in view.point], -1)
+    square = ((point[:, None] - point) ** 2).sum(-1)
+    company = (jnp.exp(-square / (2 * COMPANY**2)) * view.mask).sum(-1) * view.mask
+    return (company > 0.2 * company.max()) & (view.mask > 0)
+
+
+def first_of(wanted: Array, count: int) -> Array:
+    """Indices of the first `count` points that are wanted, then of the first others."""
+    place = jnp.arange(len(wanted))
+    return lax.top_k(-(place + jnp.where(wanted, 0, len(wanted))), count)[1]
+
+
+def windows(view: View, anchors: Array, extra: Array) -> Windows:
+    """Fits a plane and three tied bases in every window: round anchors (A, 3) in three widths, all points, `extra` (N,)."""
     x, y, z = (c[0] for c in view.point)
-    anchors = jnp.stack([x, y, z], -1)[:ANCHORS]
     square = sum((a[:, None] - c) ** 2 for a, c in zip(anchors.T, (x, y, z), strict=True))
     weight = [jnp.exp(-square / (2 * h * h)) for h in WIDTHS]
-    weight = jnp.concatenate([*weight, jnp.ones_like(square[:1])]) * view.mask
+    weight = jnp.concatenate([*weight, jnp.ones_like(square[:1]), extra[None]]) * view.mask
     # Moments of (x²+z², y², x, z, y, 1), all windows in one product.
     terms = jnp.stack([x * x + z * z, y * y, x, z, y, jnp.ones_like(x)], -1)
     pairs = np.array([(i, j) for i in range(6) for j in range(i, 6)])
@@ -123,14 +138,14 @@ def windows(view: View) -> Windows:
     )
 
 
-def front_lines(view: View) -> tuple[Array, Array]:
+def front_lines(view: View, chosen: Array) -> tuple[Array, Array]:
     """Cylinders and cones that have an anchor on the line nearest to the camera, radii and slopes on a grid."""
-    anchor = jnp.stack([c[0, :FRONT_ANCHORS] for c in view.point], -1)[:, None, :]
+    anchor = jnp.stack([c[0][chosen] for c in view.point], -1)[:, None, :]
     radii = jnp.asarray(FRONT_RADII, anchor.dtype)
     if view.ray is not None:
-        away = jnp.stack([view.ray[0][0, :FRONT_ANCHORS], view.ray[2][0, :FRONT_ANCHORS]], -1)[:, None, :]
+        away = jnp.stack([view.ray[0][0][chosen], view.ray[2][0][chosen]], -1)[:, None, :]
     else:
-        turn = np.arange(FRONT_ANCHORS) * (np.pi * (3 - np.sqrt(5)))
+        turn = np.arange(len(chosen)) * (np.pi * (3 - np.sqrt(5)))
         away = jnp.asarray(np.stack([np.cos(turn), np.sin(turn)], -1), anchor.dtype)[:, None, :]
     away = away * lax.rsqrt((away**2).sum(-1, keepdims=True) + 1e-12)
 
@@ -141,24 +156,24 @@ def front_lines(view: View) -> tuple[Array, Array]:
     return lines(0.0), jnp.concatenate([lines(s) for s in FRONT_NARROWING])
 
 
-def box_corners(view: View, planes: Array, middles: Array) -> tuple[Array, Array]:
+def box_corners(view: View, anchor: Array, planes: Array, middles: Array) -> tuple[Array, Array]:
     """Boxes of two upright faces: a window's plane and an anchor on the other face, or an anchor on both at a grid of yaws.
 
     Args:
         view: The points.
+        anchor: Points (A, 3), dense and not on the best plane.
         planes: The most upright of the best planes, (B, 4).
         middles: A point on each, (B, 3).
 
     Returns:
         Parameters (H, 4) and signs (H, 3) as in `rays.box`, without a third face.
     """
-    anchor = jnp.stack([c[0, :BOX_ANCHORS] for c in view.point], -1)
     grid = jnp.asarray(np.arange(BOX_YAWS) * (np.pi / 2 / BOX_YAWS), anchor.dtype)
     yaw = jnp.arctan2(planes[:, 2], planes[:, 0])
-    first = jnp.broadcast_to(middles[:, None, :], (len(planes), BOX_ANCHORS, 3))
+    first = jnp.broadcast_to(middles[:, None, :], (len(planes), len(anchor), 3))
     second = jnp.broadcast_to(anchor, first.shape)
-    both = jnp.broadcast_to(anchor, (BOX_YAWS, BOX_ANCHORS, 3))
-    yaws = jnp.concatenate([yaw, grid])[:, None] + jnp.zeros((1, BOX_ANCHORS), anchor.dtype)
+    both = jnp.broadcast_to(anchor, (BOX_YAWS, len(anchor), 3))
+    yaws = jnp.concatenate([yaw, grid])[:, None] + jnp.zeros((1, len(anchor)), anchor.dtype)
     through1, through2 = jnp.concatenate([first, both]), jnp.concatenate([second, both])
     c, s = jnp.cos(yaws), jnp.sin(yaws)
     k1 = c * through1[..., 0] + s * through1[..., 2]
@@ -167,21 +182,20 @@ def box_corners(view: View, planes: Array, middles: Array) -> tuple[Array, Array
     return _signed(theta, view, np.array([1.0, 1.0, 0.0]))
 
 
-def box_tops(view: View, theta: Array, signs: Array) -> tuple[Array, Array]:
-    """The same boxes with a top face through each anchor: (B * anchors, 4) and signs."""
-    height = view.point[1][0, :BOX_ANCHORS]
-    theta = jnp.broadcast_to(theta[:, None, :], (len(theta), BOX_ANCHORS, 5)).at[:, :, 3].set(height)
-    signs = jnp.broadcast_to(signs[:, None, :], (len(signs), BOX_ANCHORS, 3)).at[:, :, 2].set(1.0)
+def box_tops(height: Array, theta: Array, signs: Array) -> tuple[Array, Array]:
+    """The same boxes with a top face at each height: (B * heights, 5) and signs."""
+    theta = jnp.broadcast_to(theta[:, None, :], (len(theta), len(height), 5)).at[:, :, 3].set(height)
+    signs = jnp.broadcast_to(signs[:, None, :], (len(signs), len(height), 3)).at[:, :, 2].set(1.0)
     return theta.reshape(-1, 5), signs.reshape(-1, 3)
 
 
-def box_ledges(view: View, planes: Array, middles: Array) -> tuple[Array, Array]:
-    """Boxes of one upright face, a window's plane, and a top face through each anchor."""
+def box_ledges(view: View, height: Array, planes: Array, middles: Array) -> tuple[Array, Array]:
+    """Boxes of one upright face, a window's plane, and a top face at each height."""
     yaw = jnp.arctan2(planes[:, 2], planes[:, 0])
     k1 = jnp.cos(yaw) * middles[:, 0] + jnp.sin(yaw) * middles[:, 2]
     theta = jnp.stack([yaw, k1, 0 * k1, 0 * k1, 0 * k1], -1)
     theta, signs = _signed(theta, view, np.array([1.0, 0.0, 0.0]))
-    return box_tops(view, theta, signs)
+    return box_tops(height, theta, signs)
 
 
 def _signed(theta: Array, view: View, active: np.ndarray) -> tuple[Array, Array]:
@@ -200,3 +214,38 @@ def _through(normal: Array, point: Array) -> Array:
     normal = normal * lax.rsqrt((normal**2).sum(-1, keepdims=True) + 1e-12)
     offset = (normal * point).sum(-1, keepdims=True)
     return jnp.concatenate([normal, offset, jnp.zeros_like(offset)], -1)
+
+
+def lid_bodies(view: View, below: Array, level: Array, on: Array) -> Array:
+    """Bodies of revolution under a lid (H, 5): its points' mean and spread give the rim, a grid the rest.
+
+    Args:
+        view: The points.
+        below: What fits the points below the lid (2, 5), a cylinder and a cone.
+        level: Height of the lid.
+        on: Which points lie on it (N,).
+    """
+    x, _, z = (c[0] for c in view.point)
+    total = on.sum() + 1e-9
+    mx, mz = (on * x).sum() / total, (on * z).sum() / total
+    # A disc has ⟨ρ²⟩ = r² / 2.
+    radius = jnp.sqrt(2 * (on * ((x - mx) ** 2 + (z - mz) ** 2)).sum() / total)
+    sizes, slopes = (c.ravel() for c in np.meshgrid(LID_RADII, LID_NARROWING))
+    rim = radius * sizes
+    fields = (mx + 0 * rim, mz + 0 * rim, rim + slopes * level, 0 * rim + slopes, level + 0 * rim)
+    return jnp.concatenate([jnp.stack(fields, -1).astype(x.dtype), below.at[:, 4].set(level)])
+
+
+def lid_level(view: View, flat: Array, company: Array, clearance: float) -> tuple[Array, Array]:
+    """Height of the level surface that holds most points, and which points lie on it.
+
+    Args:
+        view: The points.
+        flat: Heights of small level pieces of surface (W,), NaN for other pieces.
+        company: Which points have company (N,).
+        clearance: Half the thickness of a level surface, in deviations.
+    """
+    y = view.point[1][0]
+    on = (jnp.abs(y - flat[:, None]) * view.gain < clearance) & company
+    level = flat[jnp.argmax(on.sum(-1))]
+    return level, (jnp.abs(y - level) * view.gain < clearance) & company
