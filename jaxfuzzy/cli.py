@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return status
     except KeyboardInterrupt:
-        say("stopped; nothing was written")
+        say("stopped")
         return STOPPED
     except BrokenPipeError:
         # Whoever read our output has gone; Python would complain once more when it closes it.
@@ -123,8 +123,9 @@ def _cluster(args: argparse.Namespace) -> int:
     from jaxfuzzy.validity import choose_k
 
     if args.out is not None:
-        table.check_target(args.out)
-        if args.out.exists() and args.out.samefile(args.points):
+        table.check_suffix(args.out)
+        _check_file(args.out)
+        if args.out.exists() and args.points.exists() and args.out.samefile(args.points):
             raise ValueError(f"out must not be the input, got {args.out}")
     names, points = table.read_points(args.points, args.columns)
     ks = args.ks
@@ -199,6 +200,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     from jaxfuzzy.calibrate import calibrate
     from jaxfuzzy.rig import save_rig
 
+    _check_file(args.out)
     with Progress(args.quiet) as progress:
         progress("looking for the board", 0.0)
         rig = calibrate(args.left, args.right, board=args.board, square_m=args.square, marker_m=args.marker)
@@ -238,6 +240,16 @@ def _scene_lines(scene: "Scene", tree: dict[str, Any]) -> Iterator[str]:
             by_reason.setdefault(reason, []).append(str(entry["object"]))
     for reason, objects in by_reason.items():
         yield f"note on {', '.join(objects)}: {reason}"
+
+
+def _check_file(path: Path) -> None:
+    """Whether a file can be written, before a long computation."""
+    if path.is_dir():
+        raise ValueError(f"out must be a file, got the folder {path}")
+    if not path.parent.is_dir():
+        raise ValueError(f"out must be in an existing folder, got {path}")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"cannot write {path}: Permission denied")
 
 
 def _modelling() -> Any:

@@ -49,16 +49,14 @@ def read_points(path: str | os.PathLike[str], columns: Sequence[str] = ()) -> tu
         raise ValueError(f"points {os.fspath(path)} {error}") from None
 
 
-def check_target(path: str | os.PathLike[str]) -> None:
-    """Whether `write_points` can write there, before a long computation.
+def check_suffix(path: str | os.PathLike[str]) -> None:
+    """Whether `write_points` knows the format a name asks for.
 
     Raises:
-        ValueError: The suffix is none of the known ones, or there is no such folder.
+        ValueError: It does not.
     """
     if Path(path).suffix.lower() not in WRITTEN:
         raise ValueError(f"out must end in one of {', '.join(WRITTEN)}, got {os.fspath(path)}")
-    if not Path(path).parent.is_dir():
-        raise ValueError(f"out must be in an existing folder, got {os.fspath(path)}")
 
 
 def write_points(path: str | os.PathLike[str], names: Sequence[str], points: np.ndarray, partition: Partition) -> None:
@@ -67,7 +65,7 @@ def write_points(path: str | os.PathLike[str], names: Sequence[str], points: np.
     Raises:
         ValueError: The suffix is none of these, or the file cannot be written.
     """
-    check_target(path)
+    check_suffix(path)
     labels, noise = np.asarray(partition.labels), np.asarray(partition.noise)
     memberships = np.asarray(partition.memberships)
     suffix = Path(path).suffix.lower()

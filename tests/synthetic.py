@@ -1,12 +1,16 @@
 """A small scene made of the records alone: what a stereo camera would see of a table with five bodies on it."""
 
+import dataclasses
 import functools
+import json
 import math
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxfuzzy
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.fcm import Partition
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Sphere
@@ -16,6 +20,7 @@ from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
 
+SCHEMA = json.loads((Path(jaxfuzzy.__file__).parent / "data" / "scene.schema.json").read_text())
 WIDTH, HEIGHT = 200, 150
 RIG = Rig((180.0, 180.0), ((WIDTH - 1) / 2, (HEIGHT - 1) / 2), 0.08, (WIDTH, HEIGHT))
 PITCH = math.radians(25)
@@ -160,3 +165,22 @@ def make_scene(*, photograph=True, dtype=np.float64):
         image_right=images[1] if photograph else None,
         rig=RIG if photograph else None,
     )
+
+
+def odd_scene():
+    """No photograph, no ground; an object of unknown kind, scores and a covariance that are not finite."""
+    plain = make_scene(photograph=False)
+    first = plain.shapes[0]
+    unknown = dataclasses.replace(
+        first, primitive=None, kind="unknown", covariance=jnp.zeros((0, 0)), scores={}, margin=math.inf
+    )
+    flat = dataclasses.replace(plain.shapes[3], covariance=jnp.full((4, 4), jnp.inf))
+    return dataclasses.replace(plain, ground=None, shapes=(unknown, *plain.shapes[1:3], flat, plain.shapes[4]))
+
+
+def empty_scene():
+    plain = make_scene(photograph=False)
+    count = len(plain.cloud.points)
+    fuzzy = dataclasses.replace(plain.segmentation.partition, memberships=jnp.zeros((count, 0)), sizes=jnp.zeros(0))
+    none = dataclasses.replace(plain.segmentation, labels=jnp.full(count, -1), k=0, partition=fuzzy)
+    return dataclasses.replace(plain, segmentation=none, shapes=(), timings={})

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import make_scene
 
 from jaxfuzzy import page, report
+from synthetic import empty_scene, make_scene
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
@@ -138,8 +138,6 @@ def test_page_is_self_contained(written):
 
 
 def test_page_without_photograph_or_objects():
-    from test_report import empty_scene
-
     bare = empty_scene()
     text = page.html(bare, report.to_dict(bare), {})
     assert "0 objects found" in text

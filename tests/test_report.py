@@ -1,6 +1,5 @@
 import dataclasses
 import json
-import math
 import struct
 import subprocess
 import sys
@@ -12,15 +11,13 @@ import jsonschema
 import numpy as np
 import pytest
 import trimesh
-from synthetic import AWAY, RIG, RIGHT, UP, bodies, make_scene
 
-import jaxfuzzy
 from jaxfuzzy import drawing, export, plot, report
 from jaxfuzzy.cloud import read_cloud
 from jaxfuzzy.primitives import Box, Sphere
 from jaxfuzzy.shapes import Shape
+from synthetic import AWAY, RIG, RIGHT, SCHEMA, UP, bodies, empty_scene, make_scene, odd_scene
 
-SCHEMA = json.loads((Path(jaxfuzzy.__file__).parent / "data" / "scene.schema.json").read_text())
 WRITTEN = {"arrays.npz", "cloud.ply", "model.glb", "model.obj", "rig.json", "scene.json"}
 
 
@@ -34,25 +31,6 @@ def saved(scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "a" / "out"
     assert set(report.save(scene, folder, view=False)) == WRITTEN
     return folder
-
-
-def odd_scene():
-    """No photograph, no ground; an object of unknown kind, scores and a covariance that are not finite."""
-    plain = make_scene(photograph=False)
-    first = plain.shapes[0]
-    unknown = dataclasses.replace(
-        first, primitive=None, kind="unknown", covariance=jnp.zeros((0, 0)), scores={}, margin=math.inf
-    )
-    flat = dataclasses.replace(plain.shapes[3], covariance=jnp.full((4, 4), jnp.inf))
-    return dataclasses.replace(plain, ground=None, shapes=(unknown, *plain.shapes[1:3], flat, plain.shapes[4]))
-
-
-def empty_scene():
-    plain = make_scene(photograph=False)
-    count = len(plain.cloud.points)
-    fuzzy = dataclasses.replace(plain.segmentation.partition, memberships=jnp.zeros((count, 0)), sizes=jnp.zeros(0))
-    none = dataclasses.replace(plain.segmentation, labels=jnp.full(count, -1), k=0, partition=fuzzy)
-    return dataclasses.replace(plain, segmentation=none, shapes=(), timings={})
 
 
 @pytest.mark.parametrize("make", [make_scene, odd_scene, empty_scene])
