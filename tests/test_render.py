@@ -66,6 +66,22 @@ def test_objects_stand_on_the_table_and_the_nearest_surface_is_seen(scene):
                 assert np.asarray(other.distance(shorter.reshape(-1, 3))).min() > 1e-4
 
 
+def test_frusta_and_leaning_bodies(scene):
+    """Any axis, a cone cut at both ends, a box with mirrored axes."""
+    axis = np.array([0.6, -0.64, 0.48])
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    bodies = (
+        Cone(apex=np.array([-0.25, 0.0, 0.8]), axis=axis, half_angle=np.array(0.4), height=np.array([0.08, 0.2])),
+        Cylinder(base=np.array([0.1, 0.1, 0.8]), axis=-axis, radius=np.array(0.05), height=np.array(0.2)),
+        Box(center=np.array([0.15, -0.1, 0.9]), size=np.array([0.1, 0.15, 0.2]), axes=turn, seen=np.ones(3, bool)),
+        Box(center=np.array([-0.1, -0.12, 0.9]), size=np.array([0.1, 0.15, 0.2]), axes=-turn, seen=np.ones(3, bool)),
+    )
+    picture = render_pair(Setting(bodies, scene.ground), SMALL, noise=0.0)
+    points = points_of(picture).astype(float)
+    for index, primitive in enumerate(bodies):
+        assert np.abs(primitive.distance(some(points[picture.labels == index]))).max() < 2e-6, primitive
+
+
 def test_a_ball_straight_ahead_by_hand():
     ball = Sphere(center=np.array([0.0, 0.0, 1.0]), radius=np.array(0.2))
     rig = Rig((100.0, 100.0), (50.0, 40.0), 0.1, (101, 81))

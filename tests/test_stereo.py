@@ -488,6 +488,8 @@ def test_sixteen_bits_floats_alpha_and_grey(table):
         gain = np.polyfit(left[::7, ::7].ravel().astype(float), one[::7, ::7].ravel().astype(float), 1)[0]
         other_gain = np.polyfit(right[::7, ::7].ravel().astype(float), other[::7, ::7].ravel().astype(float), 1)[0]
         assert gain == pytest.approx(other_gain, rel=1e-2), "the two images were scaled differently"
+    one, other = read_pair(left.astype(np.uint16) * 16, right.astype(np.uint16) * 4, table.rig)
+    assert other.max() <= one.max() // 4 + 1, "the darker image was brightened"
 
 
 GREY = np.zeros((240, 320), np.uint8)
