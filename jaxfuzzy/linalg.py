@@ -54,6 +54,19 @@ def weighted_moments(
     return mean, jnp.einsum("cn,cnq,cnp->cqp", share, offset, offset)
 
 
+def weighted_range(values: Float[Array, " N"], weights: Float[Array, " N"], tail: float = 0.02) -> Float[Array, "2"]:
+    """Where evenly spread values begin and end: two quantiles, stretched by the share that lies beyond them.
+
+    A few values far out move the ends no further than by as many places in the order of the others.
+    """
+    order = jnp.argsort(values)
+    heap = jnp.cumsum(weights[order]) - weights[order] / 2
+    heap = divide(heap, weights.sum(), 0.5)
+    low, high = jnp.interp(jnp.array([tail, 1 - tail], values.dtype), heap, values[order])
+    beyond = (high - low) * tail / (1 - 2 * tail)
+    return jnp.stack([low - beyond, high + beyond])
+
+
 @jax.custom_jvp
 def smallest_projector(matrix: Float[Array, "Q Q"], count: Int[Array, ""]) -> Float[Array, "Q Q"]:
     """Projector onto the eigenvectors of the `count` smallest eigenvalues of a symmetric matrix.
