@@ -16,7 +16,7 @@ from jaxfuzzy.status import Status
 # Okabe & Ito, "Color Universal Design", 2008, without black: told apart with any common color vision. The object's
 # number is always written beside its color, because there are more objects than colors.
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442")
-NOISE_COLOR = "#8A8A8A"
+NOISE_COLOR = "#606060"
 # Edges where the surface turns by more than this are drawn; those of a round side turn by 7.5 degrees.
 SHARP = math.radians(30.0)
 

@@ -185,7 +185,7 @@ def models(
     if points is not None:
         seen = np.asarray(points, float) @ turn
         places.append(seen)
-        kept = _thinned(ax, len(seen), DRAWN // 4)
+        kept = _thinned(ax, len(seen), 4)
         ax.scatter(*seen[kept].T, c=drawing.NOISE_COLOR, s=1, depthshade=False, linewidths=0, alpha=0.5)
     for i, shape in enumerate(shapes):
         vertices, faces = drawing.mesh(shape.primitive)
@@ -334,9 +334,9 @@ def _axes(ax: Any, size: tuple[float, float], projection: str | None = None) -> 
     return plt.figure(figsize=size, layout="constrained").add_subplot(projection=projection)
 
 
-def _thinned(ax: Any, count: int, most: int = DRAWN) -> np.ndarray:
-    """Which points to draw: every n-th where there are too many, and then a note in the axes' title."""
-    step = max(1, -(-count // most))
+def _thinned(ax: Any, count: int, share: int = 1) -> np.ndarray:
+    """Which points to draw: every n-th where there are more than `DRAWN / share`, and then a note in the axes' title."""
+    step = max(1, -(-count * share // DRAWN))
     if step > 1:
         ax.set_title(f"one point in {step} drawn", fontsize=8, color="dimgray", loc="right")
     return np.arange(0, count, step)
