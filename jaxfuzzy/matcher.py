@@ -13,6 +13,8 @@ STEP = 16  # OpenCV searches a multiple of 16 disparities
 class Matcher:
     """How to match. The defaults are those that answered most and erred least on ten real scenes with ground truth.
 
+    Holes are left open: filters that fill them (opencv-contrib's WLS, say) invent surface between objects.
+
     Attributes:
         method: "sgbm" (semi-global, three directions), "hh" (all directions: smoother fractions, several times slower)
             or "bm" (block matching: only where there is texture).
@@ -24,11 +26,10 @@ class Matcher:
         left_right_px: Largest difference between matching left to right and right to left; None leaves the check out.
         speckle_px: Connected patches of at most so many pixels are removed; 0 keeps them.
         edge_px: Pixels to erode from the nearer side of a depth edge, where matching bleeds over; 0 keeps them.
-        refine: Refine the matcher's sixteenths of a pixel by the images' gradients; on the same ten scenes the deviation
-            from the truth falls by a quarter to a half.
+        refine: Refine the matcher's sixteenths of a pixel by the images' gradients, without which clouds come in layers;
+            on twelve real scenes the deviation from the truth fell by a sixth to a half, from 0.29 to 0.20 px on average.
         disparity_std_px: Standard deviation of a disparity, from which every point's `depth_std` comes. The default is
-            the middle of 0.13 to 0.32 px measured on real scenes at 370 to 560 rows; unrefined it is 0.3, and at
-            1,500 rows twice that.
+            the mean of 0.13 to 0.32 px measured on these scenes, of 370 to 560 rows; at 1,500 rows it was 0.6.
     """
 
     method: str = "sgbm"

@@ -16,6 +16,7 @@ from jaxfuzzy.rig import Rig
 
 Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
 
+SMALLEST = 32
 ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
 
 
@@ -35,6 +36,8 @@ def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
         sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]
         raise ValueError(f"left and right must have the same size, got {sizes[0]} and {sizes[1]}")
     height, width = images[0].shape[:2]
+    if min(height, width) < SMALLEST:
+        raise ValueError(f"images must be at least {SMALLEST} pixels wide and high, got {width} x {height}")
     if rig.image_size is not None and (width, height) != rig.image_size:
         raise ValueError(
             f"images must have the size the rig is for, {rig.image_size[0]} x {rig.image_size[1]}, got {width} x"

@@ -26,6 +26,7 @@ MODES = {"sgbm": cv2.StereoSGBM_MODE_SGBM_3WAY, "hh": cv2.StereoSGBM_MODE_HH}
 FEWEST_POINTS = 50
 FEW_MATCHES_SHARE = 0.1
 MISALIGNED_PX = 0.75  # rows may differ by less without harm
+BM_BLOCK = 15  # block matching needs more to tell places apart
 SIXTEENTHS = 16  # OpenCV's fixed point: disparities are int16, 16 a pixel
 COARSE_WIDTH = 320  # the disparity range is looked for on images no wider than this
 RANGE_SHARE = 0.002  # share of coarse matches left out at either end of the range
@@ -123,10 +124,11 @@ def search_range(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple
         first, last = _scene_range(left, right, rig, matcher)
         low = first if low is None else low
         count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
-    if width <= matcher.block or count > STEP * -(-width // STEP):
+    block = max(matcher.block, BM_BLOCK) if matcher.method == "bm" else matcher.block
+    if min(left.shape[:2]) <= block or count > STEP * -(-width // STEP):
         raise ValueError(
-            f"images are {width} pixels wide, too narrow for {count} disparities and blocks of {matcher.block}:"
-            " give smaller ones or larger images"
+            f"images are {width} pixels wide and {left.shape[0]} high, too small for {count} disparities and blocks of"
+            f" {block}: give smaller ones or larger images"
         )
     return low, count
 
@@ -161,8 +163,7 @@ def _match(left: Image, right: Image, low: int, count: int, matcher: Matcher) ->
         for image in (left, right)
     ]
     if matcher.method == "bm":
-        block = max(matcher.block, 15)
-        bm = cv2.StereoBM.create(count, block)
+        bm = cv2.StereoBM.create(count, max(matcher.block, BM_BLOCK))
         bm.setMinDisparity(low)
         bm.setUniquenessRatio(matcher.uniqueness)
         values = bm.compute(grey(padded[0]), grey(padded[1]))

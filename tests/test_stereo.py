@@ -215,10 +215,12 @@ def test_narrow_images_are_refused_and_answers_repeat():
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (40, 60), np.uint8)
     rig = Rig((100, 100), (30, 20), 0.1, (60, 40))
-    with pytest.raises(ValueError, match="60 pixels wide, too narrow for 80 disparities"):
+    with pytest.raises(ValueError, match="60 pixels wide and 40 high, too small for 80 disparities"):
         disparity(picture, picture, rig, matcher=Matcher(disparities=80, min_disparity=0))
-    with pytest.raises(ValueError, match="too narrow"):
-        disparity(picture[:, :5], picture[:, :5], dataclasses.replace(rig, image_size=None), matcher=Matcher(block=7))
+    with pytest.raises(ValueError, match="blocks of 41"):
+        disparity(picture, picture, rig, matcher=Matcher(method="bm", block=41))
+    with pytest.raises(ValueError, match="at least 32 pixels wide and high, got 5 x 40"):
+        disparity(picture[:, :5], picture[:, :5], dataclasses.replace(rig, image_size=None))
     first, *others = [disparity(picture, np.roll(picture, -4, axis=1), rig) for _ in range(3)]
     for other in others:
         np.testing.assert_array_equal(first[0], other[0])
