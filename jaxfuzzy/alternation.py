@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxfuzzy.arrays import Array, Float, Int, record
 from jaxfuzzy.memberships import log_strengths, shares
 from jaxfuzzy.status import Status
-from jaxfuzzy.tiles import Tiles, expanded_distances, squared_distances, sum_tiles
+from jaxfuzzy.tiles import Tiles, expanded_distances, offsets, squared_distances, sum_tiles
 
 # Two centers nearer to each other than this share of their own points' RMS distance count as one.
 SAME_PLACE = 1e-2
@@ -53,8 +53,16 @@ def strengths_of(theta: Theta, mask: Array | None) -> Float[Array, " K"] | None:
     return None if strengths is None else strengths.astype(theta["centers"].dtype)
 
 
-def sweep(theta: Theta, args: Args, *, square: bool, exact: bool) -> Sums:
-    """One pass over the points. `square` is the short cut for m = 2, `exact` takes distances by differences."""
+def sweep(theta: Theta, args: Args, *, square: bool, exact: bool, scatter: bool) -> Sums:
+    """One pass over the points.
+
+    Args:
+        theta: Prototypes.
+        args: What else it reads.
+        square: Take the short cut for m = 2.
+        exact: Take distances by differences.
+        scatter: Add up the scatter too, which is left at zero otherwise.
+    """
     tiles, m, squared_noise, mask = args
     centers, strengths = theta["centers"], strengths_of(theta, mask)
     distances = squared_distances if exact else expanded_distances
@@ -63,11 +71,9 @@ def sweep(theta: Theta, args: Args, *, square: bool, exact: bool) -> Sums:
     lowest = jnp.asarray(-1e4, dtype)
     zero = jnp.zeros((), dtype)
 
-    def add(
-        sums: tuple[Array, Array, Array, Array, Array], x: Array, w: Array
-    ) -> tuple[Array, Array, Array, Array, Array]:
-        mass, moment, scatter, objective, shift = sums
-        apart = distances(x, centers)
+    def add(sums: tuple[Array, Array, Array, Array], block: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+        moments, scatters, objective, shift = sums
+        apart = distances(block, centers)
         if square:
             power, term = _square_powers(apart, strengths, squared_noise)
             new_shift, rescale = zero, jnp.ones((), dtype)
@@ -79,22 +85,20 @@ def sweep(theta: Theta, args: Args, *, square: bool, exact: bool) -> Sums:
             power, term = jnp.exp(logs - new_shift), part.objective(m, new_shift)
         power = power * w
         return (
-            mass * rescale + power.sum(axis=1),
-            moment * rescale + jnp.matmul(power, x.T, precision=jax.lax.Precision.HIGHEST),
-            scatter * rescale + (power * apart).sum(axis=1),
+            moments * rescale + jnp.matmul(power, block.T, precision=jax.lax.Precision.HIGHEST),
+            scatters * rescale + (power * apart).sum(axis=1) if scatter else scatters,
             objective * rescale + term @ w,
             new_shift,
         )
 
     start = (
-        jnp.zeros(clusters, dtype),
-        jnp.zeros((clusters, dims), dtype),
+        jnp.zeros((clusters, dims + 2), dtype),
         jnp.zeros(clusters, dtype),
         zero,
         zero if square else 2 * lowest,
     )
-    mass, moment, scatter, objective, shift = sum_tiles(tiles, add, start)
-    return Sums(mass, moment, scatter, jnp.log(objective) + shift, shift)
+    moments, scatters, objective, shift = sum_tiles(tiles, add, start)
+    return Sums(moments[:, -1], moments[:, :dims], scatters, jnp.log(objective) + shift, shift)
 
 
 def _square_powers(
@@ -115,7 +119,7 @@ def _square_powers(
 def step(theta: Theta, args: Args, *, sizes: bool, square: bool, exact: bool) -> tuple[Theta, Array]:
     """One round of alternating optimisation (eqs. 9, 10, 11) and the objective where it started from."""
     _, m, _, mask = args
-    sums = sweep(theta, args, square=square, exact=exact)
+    sums = sweep(theta, args, square=square, exact=exact, scatter=sizes)
     filled = sums.mass > 0
     mass = jnp.where(filled, sums.mass, 1)
     centers = jnp.where(filled[:, None], sums.moment / mass[:, None], theta["centers"])
@@ -145,11 +149,11 @@ def step_jacobian(theta: Theta, args: Args, *, sizes: bool) -> Float[Array, "p p
     clusters, dims = centers.shape
     rows = dims + 1 if sizes else dims
     r = 1 / (m - 1)
-    shift = sweep(theta, args, square=False, exact=True).shift
+    shift = sweep(theta, args, square=False, exact=True, scatter=False).shift
 
-    def add(sums: tuple[Array, Array, Array, Array], x: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    def add(sums: tuple[Array, Array, Array, Array], block: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         crossed, own, mass, scatter = sums
-        offset = x[None] - centers[:, :, None]
+        offset = offsets(block, centers)
         apart = jnp.square(offset).sum(axis=1)
         part = shares(apart, m, strengths, squared_noise)
         u, power = part.memberships, jnp.exp(part.log_powers(m) - shift) * w
@@ -204,8 +208,8 @@ def diagnose(theta: Theta, args: Args, sums: Sums, converged: Array, *, sizes: b
     clusters, dims = centers.shape
     real = jnp.ones(clusters, bool) if mask is None else mask
 
-    def add(total: Array, x: Array, w: Array) -> Array:
-        offset = x[None] - centers[:, :, None]
+    def add(total: Array, block: Array, w: Array) -> Array:
+        offset = offsets(block, centers)
         apart = jnp.square(offset).sum(axis=1)
         part = shares(apart, m, strengths, squared_noise)
         power = jnp.exp(part.log_powers(m) - sums.shift) * w

@@ -166,7 +166,7 @@ def _fit(
         real = jnp.ones(clusters, bool) if mask is None else mask
         start["log_sizes"] = jnp.where(real, -jnp.log(real.sum().astype(points.dtype)), 0)
     # Static flags are bound here; what is traced goes through the arguments.
-    short = partial(step, sizes=sizes, square=square, exact=tiles.points.shape[0] == 1)
+    short = partial(step, sizes=sizes, square=square, exact=tiles.blocks.shape[0] == 1)
     smooth = partial(step, sizes=sizes, square=False, exact=True)
     solve = partial(fixed_point, short, solver=effort, smooth_step=smooth, jacobian=partial(step_jacobian, sizes=sizes))
     if rule is not None:
@@ -177,7 +177,7 @@ def _fit(
     args = (tiles, m, squared_noise, mask)
     solution = solve(start, args)
     theta = solution.theta
-    sums = sweep(theta, args, square=False, exact=True)
+    sums = sweep(theta, args, square=False, exact=True, scatter=True)
     status = diagnose(theta, args, sums, solution.converged, sizes=sizes)
     partition = Partition(
         centers=tiles.mean + tiles.scale * theta["centers"],
@@ -222,11 +222,11 @@ def _memberships(
     """Memberships and noise of the tiled points, padding included, tile by tile."""
     strengths, clusters = strengths_of(theta, mask), theta["centers"].shape[0]
 
-    def one(x: Array) -> tuple[Array, Array]:
-        part = shares(squared_distances(x, theta["centers"]), m, strengths, squared_noise)
+    def one(block: Array) -> tuple[Array, Array]:
+        part = shares(squared_distances(block, theta["centers"]), m, strengths, squared_noise)
         return part.memberships.T, part.noise
 
-    u, noise = jax.lax.map(jax.checkpoint(one), tiles.points)
+    u, noise = jax.lax.map(jax.checkpoint(one), tiles.blocks)
     return u.reshape(-1, clusters), noise.reshape(-1)
 
 
@@ -263,7 +263,7 @@ def memberships(points: ArrayLike, partition: Partition) -> Float[Array, "N K"]:
 
 def _rule_distance(rule: NoiseRule, tiles: Tiles, centers: Array, mask: Array | None) -> Array:
     """The noise distance by rule, in the input's units."""
-    apart = jax.lax.map(lambda x: squared_distances(x, centers), tiles.points)  # (T, K, n)
+    apart = jax.lax.map(lambda block: squared_distances(block, centers), tiles.blocks)  # (T, K, n)
     real = jnp.ones(centers.shape[0], bool) if mask is None else mask
     if rule.name == "dave":
         total = jnp.einsum("tkn,tn,k->", apart, tiles.weights, real.astype(apart.dtype))

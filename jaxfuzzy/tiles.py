@@ -24,7 +24,7 @@ class Tiles:
     """Points in tiles, in units where their weighted mean is 0 and their RMS distance from it is 1.
 
     Attributes:
-        points: Tiles of points; padding points lie at 0.
+        blocks: Tiles of points, one a column: coordinates, squared length, 1. Padding points lie at 0.
         weights: Weight of each point; padding has 0.
         mean: What was taken off, in the input's units.
         scale: What was divided by; 1 where all points are equal.
@@ -32,7 +32,7 @@ class Tiles:
         count: Number of points N.
     """
 
-    points: Float[Array, "T D n"]
+    blocks: Float[Array, "T D_2 n"]
     weights: Float[Array, "T n"]
     mean: Float[Array, " D"]
     scale: Float[Array, ""]
@@ -57,8 +57,11 @@ def tile_points(points: Float[Array, "N D"], weights: Float[Array, " N"] | None,
     rows = -(-rows // 8) * 8
     tiles = -(-count // rows)
     pad = tiles * rows - count
-    inside = jnp.pad(inside, ((0, pad), (0, 0))).reshape(tiles, rows, dims).transpose(0, 2, 1)
-    return Tiles(inside, jnp.pad(weights, (0, pad)).reshape(tiles, rows), mean, scale, spread, count)
+    inside = jnp.pad(inside, ((0, pad), (0, 0)))
+    # With its squared length and a 1 beside each point, distances and sums are one matrix product each.
+    design = [inside, jnp.square(inside).sum(axis=1, keepdims=True), jnp.ones_like(inside[:, :1])]
+    blocks = jnp.concatenate(design, axis=1).reshape(tiles, rows, dims + 2).transpose(0, 2, 1)
+    return Tiles(blocks, jnp.pad(weights, (0, pad)).reshape(tiles, rows), mean, scale, spread, count)
 
 
 def frame(points: Float[Array, "N D"], weights: Float[Array, " N"] | None) -> tuple[Array, Array]:
@@ -80,22 +83,26 @@ def frame(points: Float[Array, "N D"], weights: Float[Array, " N"] | None) -> tu
 
 
 def sum_tiles(tiles: Tiles, body: Callable[[Sums, Array, Array], Sums], start: Sums) -> Sums:
-    """Adds up over tiles: `body(sums, points (D, n), weights (n,)) -> sums`, one tile in memory at a time.
+    """Adds up over tiles: `body(sums, block (D + 2, n), weights (n,)) -> sums`, one tile in memory at a time.
 
     Going backward each tile is computed again rather than kept, so a gradient needs no N × K memory either.
     """
     step = jax.checkpoint(lambda sums, tile: (body(sums, *tile), None))
-    return lax.scan(step, start, (tiles.points, tiles.weights))[0]
+    return lax.scan(step, start, (tiles.blocks, tiles.weights))[0]
 
 
-def squared_distances(points: Float[Array, "D n"], centers: Float[Array, "K D"]) -> Float[Array, "K n"]:
+def offsets(block: Float[Array, "D_2 n"], centers: Float[Array, "K D"]) -> Float[Array, "K D n"]:
+    """From each center to each point of a tile."""
+    return block[None, : centers.shape[1]] - centers[:, :, None]
+
+
+def squared_distances(block: Float[Array, "D_2 n"], centers: Float[Array, "K D"]) -> Float[Array, "K n"]:
     """Squared distances by differences: exact, zero where a point lies on a center."""
-    return jnp.square(points[None] - centers[:, :, None]).sum(axis=1)
+    return jnp.square(offsets(block, centers)).sum(axis=1)
 
 
-def expanded_distances(points: Float[Array, "D n"], centers: Float[Array, "K D"]) -> Float[Array, "K n"]:
+def expanded_distances(block: Float[Array, "D_2 n"], centers: Float[Array, "K D"]) -> Float[Array, "K n"]:
     """Squared distances by one matrix product: faster, right to rounding of the data's own scale; never negative."""
-    design = jnp.concatenate([points, jnp.square(points).sum(axis=0, keepdims=True), jnp.ones_like(points[:1])])
     norms = jnp.square(centers).sum(axis=1, keepdims=True)
     factors = jnp.concatenate([-2 * centers, jnp.ones_like(norms), norms], axis=1)
-    return jnp.maximum(jnp.matmul(factors, design, precision=lax.Precision.HIGHEST), 0)
+    return jnp.maximum(jnp.matmul(factors, block, precision=lax.Precision.HIGHEST), 0)

@@ -1,0 +1,146 @@
+"""The whole way: rendered scenes with exact truth, the paper's own figures, the bundled photograph, bad input."""
+
+import numpy as np
+import pytest
+
+from jaxfuzzy import scene as module
+from jaxfuzzy.checks import DataError
+from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.fcm import fcm
+from jaxfuzzy.render import paper_scene, render_pair
+from jaxfuzzy.rig import Rig
+from jaxfuzzy.scene import load_scene, model_cloud, model_scene
+from jaxfuzzy.seeding import histogram_seeds
+from jaxfuzzy.stereo import example_pair, reconstruct
+from jaxfuzzy.validity import choose_k
+from jaxfuzzy.varieties import nfcv
+
+
+@pytest.fixture(scope="module")
+def paper_pair():
+    return render_pair(paper_scene())
+
+
+@pytest.fixture(scope="module")
+def modelled(paper_pair):
+    # Single precision, as the command line computes.
+    return model_scene(paper_pair.left, paper_pair.right, paper_pair.rig)
+
+
+def by_truth(scene, rendered):
+    """The true object of each modelled one, by its points' pixels."""
+    columns, rows = np.round(np.asarray(scene.cloud.pixels_px)).astype(int).T
+    truth, labels = rendered.labels[rows, columns], np.asarray(scene.segmentation.labels)
+    return [np.bincount(truth[labels == i] + 1).argmax() - 1 for i in range(scene.segmentation.k)]
+
+
+def test_rendered_paper_scene_has_two_objects_of_the_right_kinds(modelled, paper_pair):
+    assert modelled.segmentation.k == 2
+    kinds = dict(zip(by_truth(modelled, paper_pair), (shape.kind for shape in modelled.shapes), strict=True))
+    assert kinds == {0: "cylinder", 1: "box"}
+    cylinder = next(shape.primitive for shape in modelled.shapes if shape.kind == "cylinder")
+    # True radius 45 mm; matched at a metre with a depth step of about a millimetre, 3 per cent is what is asked of the front end.
+    np.testing.assert_allclose(cylinder.radius, 0.045, rtol=0.03)
+    assert abs(float(cylinder.axis[1])) > 0.99
+
+
+def test_the_papers_own_stages_on_its_own_scene(paper_pair):
+    # The figures that the paper gives: k = 2 by the variance ratio, two sizes, inliers of the cylinder at delta = 0.5.
+    cloud = reconstruct(paper_pair.left, paper_pair.right, paper_pair.rig)
+    columns, rows = np.round(np.asarray(cloud.pixels_px)).astype(int).T
+    truth = paper_pair.labels[rows, columns]
+    objects = 100 * np.asarray(cloud.points, float)[truth >= 0]  # centimetres: the paper names no unit
+    plane = objects[:, [0, 2]]
+    count = choose_k(plane, (2, 3, 4, 5), index="vrc", rule="paper")
+    assert int(count.k) == 2
+    sized = fcm(plane, histogram_seeds(plane, 2).centers, sizes=True)
+    larger = float(np.max(np.asarray(sized.sizes)))
+    assert 0.5 < larger < 0.95
+    cylinder = objects[truth[truth >= 0] == 0]
+    start = np.ones((len(cylinder), 1))
+    counts = {}
+    for name in ("3d", "4d", "6d"):
+        fit = nfcv(cylinder, start, embedding=name, distance="algebraic", noise_distance=0.5)
+        counts[name] = int(np.asarray(fit.inliers).sum())
+    # At delta = 0.5 in raw camera coordinates both curved embeddings take in all but a few points, as the paper's 1121 of 1141 do.
+    assert counts["4d"] >= 0.98 * len(cylinder)
+    assert counts["6d"] >= 0.98 * len(cylinder)
+    assert counts["3d"] < counts["4d"]
+
+
+def test_scene_survives_the_disk(modelled, tmp_path):
+    modelled.save(tmp_path / "out")
+    again = load_scene(tmp_path / "out")
+    assert [shape.kind for shape in again.shapes] == [shape.kind for shape in modelled.shapes]
+    np.testing.assert_array_equal(again.segmentation.labels, modelled.segmentation.labels)
+    np.testing.assert_array_equal(again.cloud.points, modelled.cloud.points)
+
+
+def test_bundled_pair_shows_its_cones():
+    scene = model_scene(*example_pair())
+    labels, pixels = np.asarray(scene.segmentation.labels), np.asarray(scene.cloud.pixels_px)
+    # Where three photographed cones stand, by eye: the two green ones in front and the red one at the left.
+    for column, row in ((237, 300), (120, 300), (78, 245)):
+        here = np.abs(pixels - [column, row]).max(axis=1) <= 4
+        owner = np.bincount(labels[here] + 1).argmax() - 1
+        assert owner >= 0
+        assert scene.shapes[owner].kind == "cone"
+        # Reference: half-angles of 19 to 21 degrees by a joint fit of the full-size pair; the rig is nominal.
+        assert 15 < np.degrees(float(scene.shapes[owner].primitive.half_angle)) < 26
+        # Alone: its points span no more than one cone's width, about 100 px.
+        assert np.ptp(pixels[labels == owner], axis=0).max() < 140
+    assert scene.segmentation.k >= 8
+
+
+def test_a_cloud_without_a_table_needs_the_vertical():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(np.pi, 2 * np.pi, 600)
+    points = np.stack([0.05 * np.cos(angle), rng.uniform(0, 0.15, 600), 1 + 0.05 * np.sin(angle)], axis=1)
+    points += 0.0005 * rng.normal(size=points.shape)
+    with pytest.raises(ValueError, match="up must be given"):
+        model_cloud(Cloud(points), ground=None)
+    scene = model_cloud(Cloud(points), ground=None, up=(0, 1, 0))
+    assert scene.ground is None
+    assert [shape.kind for shape in scene.shapes] == ["cylinder"]
+    np.testing.assert_allclose(scene.shapes[0].primitive.radius, 0.05, rtol=0.01)
+
+
+def test_progress_is_told_in_order(paper_pair):
+    told = []
+    points = np.asarray(reconstruct(paper_pair.left, paper_pair.right, paper_pair.rig).points)
+    model_cloud(Cloud(points[::5]), progress=lambda stage, share: told.append((stage, share)))
+    assert [stage for stage, _ in told] == ["ground", "objects", "shapes"]
+    assert sorted(share for _, share in told) == [share for _, share in told]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "word"),
+    [
+        ({"ks": ()}, ValueError, "ks"),
+        ({"up": (0, 0, 0)}, ValueError, "up"),
+        ({"ground": "wall"}, ValueError, "ground"),
+        ({"rule": "best"}, ValueError, "rule"),
+        ({"colour": 1}, TypeError, "colour"),
+        ({"noise_distance": -1.0}, ValueError, "noise_distance"),
+    ],
+)
+def test_wrong_options_are_named(options, error, word):
+    points = np.random.default_rng(0).normal(size=(200, 3)) + [0, 0, 5]
+    with pytest.raises(error, match=word):
+        model_cloud(Cloud(points), **({"ground": None, "up": (0, 1, 0)} | options))
+
+
+def test_bad_pairs_are_refused_with_one_clear_line(paper_pair, tmp_path):
+    small = paper_pair.left[:100, :100]
+    with pytest.raises(ValueError, match="size"):
+        model_scene(paper_pair.left, small, paper_pair.rig)
+    with pytest.raises(FileNotFoundError, match=r"none\.png"):
+        model_scene(tmp_path / "none.png", paper_pair.right, paper_pair.rig)
+    blank = np.full_like(paper_pair.left, 128)
+    with pytest.raises(DataError, match="matched"):
+        model_scene(blank, blank, paper_pair.rig)
+    other = Rig(focal_px=(700, 700), center_px=(160, 120), baseline_m=0.08, image_size=(320, 200))
+    with pytest.raises(ValueError, match="size"):
+        model_scene(paper_pair.left, paper_pair.right, other)
+    with pytest.raises(DataError, match=str(module.FEWEST_POINTS)):
+        model_cloud(Cloud(np.random.default_rng(0).normal(size=(20, 3)) + [0, 0, 5]))
