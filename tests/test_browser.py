@@ -233,6 +233,8 @@ def test_light_and_dark_desk_and_phone(browser, address, phone):
         assert contrast(tones, [int(v) / 255 for v in re.findall(r"\d+", ink)[:3]]) > 7
         soft = one.execute_script("return getComputedStyle(document.querySelector('.soft')).color")
         assert contrast(tones, [int(v) / 255 for v in re.findall(r"\d+", soft)[:3]]) > 4.5
+    opened(one, address)  # dark from the start this time, not by a change
+    wait(one, lambda: np.median(picture(one)[:20]) <= 0.15)
     width = one.execute_script("return [document.documentElement.scrollWidth, innerWidth]")
     assert width[0] <= width[1], "the page must not scroll sideways"
     if phone:
