@@ -12,8 +12,8 @@ PACKAGE = Path(__file__).parents[1] / "jaxfuzzy"
 ORDER = """
     arrays status checks linalg memberships tiles solve alternation fcm embedding varietystep varieties conditioning
     seeding validity density segment meshes primitives refine recover bodies simulate
-    rays bounds starts noise search polish choice shapes groups
-    files cloudfiles cloud planes ground rig rigfiles matcher photos calibrate reproject stereo render
+    rays bounds starts local choice search polish fitting objects shapes groups
+    files cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
     scene tuning drawing plot export folder page report table estimators arguments terminal cli __init__
 """.split()
 DOORS = {

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import oracles
-from jaxfuzzy import fcm as module
-from jaxfuzzy.fcm import NoiseRule, fcm, memberships
+from jaxfuzzy.fcm import NoiseRule, _fit, fcm, memberships
 from jaxfuzzy.solve import Solver
 from jaxfuzzy.status import Status
 
@@ -174,10 +173,10 @@ def test_short_cuts_take_the_same_step():
 
 def test_compiles_once_for_all_values():
     x, seeds = blobs()
-    traces = module._fit._cache_size()
+    traces = _fit._cache_size()
     for m, delta in ((1.5, 2.0), (1.8, 3.0), (2.5, 4.0)):
         fcm(x, seeds, m=m, noise_distance=delta, solver=Solver(tol=1e-4 * m))
-    assert module._fit._cache_size() == traces + 1
+    assert _fit._cache_size() == traces + 1
 
 
 @settings(max_examples=20, deadline=None)

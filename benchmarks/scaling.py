@@ -1,0 +1,89 @@
+"""Cost of a sweep against the number of points and of clusters: linear in both, with a plot.
+
+    python benchmarks/scaling.py [--most 1e7]
+
+Float32, D = 3, m = 2 and m = 1.7; one sweep from two runs of different length, warm. Peak memory is that of a process of its own,
+less what it held before the points were made.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+
+import numpy as np
+from common import RESULTS, provenance, table, timings, write
+
+CODE = """
+import json, resource, sys, numpy as np, jax, jaxfuzzy as jf
+n, k = int(sys.argv[1]), 8
+small = np.zeros((1000, 3), np.float32); small[:, 0] = np.arange(1000)
+jf.fcm(small, small[:k], memberships=False, solver=jf.Solver(2, 0.0)).centers.block_until_ready()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+x = jax.random.normal(jax.random.key(0), (n, 3), dtype=np.float32)
+jf.fcm(x, x[:k], memberships=False, solver=jf.Solver(5, 0.0)).centers.block_until_ready()
+print(json.dumps(1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / (12 * n)))
+"""
+
+
+def a_sweep(n: int, k: int, m: float) -> float:
+    import jax
+
+    import jaxfuzzy as jf
+
+    x = jax.random.normal(jax.random.key(0), (n, 3), dtype=np.float32)
+    run = lambda steps: jf.fcm(
+        x, x[:k], m=m, memberships=False, solver=jf.Solver(steps, 0.0, None)
+    ).centers.block_until_ready()
+    few, many = (2, 12) if n > 1e5 else (10, 110)
+    repeats = 3 if n > 1e6 else 7
+    return (timings(lambda: run(many), repeats)["median"] - timings(lambda: run(few), repeats)["median"]) / (many - few)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--most", type=float, default=1e7, help="largest number of points")
+    args = parser.parse_args()
+    print(provenance())
+    counts = [n for n in (10**3, 10**4, 10**5, 10**6, 3 * 10**6, 10**7, 3 * 10**7) if n <= args.most]
+    clusters = (2, 4, 8, 16, 32, 64)
+    by_count = {n: {m: a_sweep(n, 8, m) for m in (2.0, 1.7)} for n in counts}
+    by_clusters = {k: {m: a_sweep(200_000, k, m) for m in (2.0, 1.7)} for k in clusters}
+    memory = {
+        n: json.loads(
+            subprocess.run([sys.executable, "-c", CODE, str(n)], capture_output=True, text=True, check=True).stdout
+        )
+        for n in counts
+        if n >= 10**6
+    }
+    table(
+        "Nanoseconds a sweep and point, K = 8",
+        ("N", "m = 2", "m = 1.7", "peak memory over the points' own size"),
+        [(n, 1e9 * r[2.0] / n, 1e9 * r[1.7] / n, memory.get(n, "")) for n, r in by_count.items()],
+    )
+    table(
+        "Nanoseconds a sweep, point and cluster, N = 200,000",
+        ("K", "m = 2", "m = 1.7"),
+        [(k, 1e9 * r[2.0] / k / 2e5, 1e9 * r[1.7] / k / 2e5) for k, r in by_clusters.items()],
+    )
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    for axes, rows, label in ((left, by_count, "points N, K = 8"), (right, by_clusters, "clusters K, N = 200,000")):
+        xs = np.array(list(rows), float)
+        for m, style in ((2.0, "o-"), (1.7, "s-")):
+            axes.loglog(xs, [1e3 * r[m] for r in rows.values()], style, label=f"m = {m:g}")
+        last = 1e3 * rows[max(rows)][2.0]
+        axes.loglog(xs, last * xs / xs[-1], "k:", label="linear")
+        axes.set(xlabel=label, ylabel="ms a sweep")
+        axes.legend()
+    RESULTS.mkdir(exist_ok=True)
+    figure.savefig(RESULTS / "scaling.png", dpi=110)
+    write("scaling", {"by_count": by_count, "by_clusters": by_clusters, "memory": memory})
+
+
+if __name__ == "__main__":
+    main()
