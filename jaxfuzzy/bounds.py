@@ -5,24 +5,14 @@ become rare: the stretch that holds the most points over a price per length, a t
 outliers beyond do not move it and it lands on the last point of the surface itself.
 """
 
-from typing import NamedTuple
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.arrays import Array
+from jaxfuzzy.objects import Frame
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Sphere
 
 PRICE = 0.35
-
-
-class Frame(NamedTuple):
-    """From metres in the user's frame to an object's own: q = turn (p - origin) / unit."""
-
-    turn: Array
-    origin: Array
-    unit: Array
 
 
 def stretch(values: np.ndarray) -> tuple[float, float, float]:

@@ -78,6 +78,16 @@ def mixture(residual: Residual, view: View, depth_range: Array, scale_bounds: tu
     )
 
 
+def gric(residual: Residual, mask: Array, parameters: Array) -> Array:
+    """Torr's geometric robust information criterion for surfaces, Σ min(e²/σ², 2) + k ln(3 n); lower is better.
+
+    Torr, "Bayesian model estimation and selection for epipolar geometry and generic manifold fitting", IJCV 50(1), 2002; the term
+    in the dimension of the manifold is the same for all surfaces and left out.
+    """
+    square = residual.error**2 + residual.miss**2
+    return (mask * jnp.minimum(square, 2.0)).sum(-1) + parameters * jnp.log(3 * mask.sum())
+
+
 def cone_tapers(theta: Array, own: Array, height: Array) -> Array:
     """A cone must narrow by a quarter over its inliers, and by more than 0.06 and less than 2.2 a unit of height."""
     total = own.sum(-1) + 1e-9

@@ -20,6 +20,8 @@ FEW, MORE = 256, 768
 # How many of each kind are moved on a few points.
 KEPT = 6
 PATCHES = 24
+# Of the spread of an object: below lies the rounding of single precision.
+LEAST_DEVIATION = 2e-5
 SCREEN = 2.0
 COARSE = tuple(np.geomspace(4.0, 2.5, 6))
 FINE = tuple(np.geomspace(3.0, 2.5, 5))
@@ -114,21 +116,27 @@ class Found(NamedTuple):
     Attributes:
         kind: Index of the best kind.
         scores: Score of each kind, lower is better (5,).
+        passed: Whether it is allowed and no guard speaks against its best candidate (5,).
         candidates: The best candidate of each kind.
         scale: Noise scale of each.
         background: Share of background of each.
         deviation: What the points' deviations were found to be, in units of 1 / gain; 1 where given.
+        local: What small windows say of them, in units of those used.
+        normals: Normals of small pieces of surface (W, 3), 0 where unusable.
     """
 
     kind: Array
     scores: Array
+    passed: Array
     candidates: Candidates
     scale: Array
     background: Array
     deviation: Array
+    local: Array
+    normals: Array
 
 
-def search(view: View, depth_range: Array, allowed: Array, given: Array) -> Found:
+def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: Array) -> Found:
     """Finds the best surface of each kind and chooses among the allowed ones (5,).
 
     Args:
@@ -136,13 +144,15 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array) -> Foun
         depth_range: Range of depth over which background is spread.
         allowed: Which kinds may be chosen (5,).
         given: Whether the deviation of the points is known.
+        gric: Whether to score by GRIC in place of the likelihood.
     """
     dtype = view.gain.dtype
     few = rays.taken(view, FEW)
     company = starts.dense(few)
     anchors = jnp.stack([c[0] for c in few.point], -1)[starts.first_of(company, starts.ANCHORS)]
     patches = local.patches(rays.taken(view, MORE), anchors[:PATCHES])
-    deviation = jnp.where(given, 1.0, jnp.maximum(local.typical_deviation(patches), 1e-6))
+    typical = jnp.maximum(local.typical_deviation(patches), LEAST_DEVIATION)
+    deviation = jnp.where(given, 1.0, typical)
     view = view._replace(gain=view.gain / deviation)
     turn = local.lean(view, patches)
     few, more = rays.turned(rays.taken(view, FEW), turn[None]), rays.taken(view, MORE)
@@ -158,7 +168,9 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array) -> Foun
     r = residuals(fine, counts, rays.turned(more, fine.turn), lids)
     mixed = choice.mixture(r, more, depth_range, (0.35, 1.6))
     count = more.mask.sum()
-    score = -mixed.log_likelihood + 0.5 * fine.free.sum(-1) * jnp.log(count)
+    parameters = fine.free.sum(-1) - jnp.concatenate([jnp.ones(counts[0]), jnp.zeros(sum(counts[1:]))]).astype(dtype)
+    likelihood = -mixed.log_likelihood + 0.5 * parameters * jnp.log(count)
+    score = jnp.where(gric, choice.gric(r, more.mask, parameters), likelihood)
     p, b, n, s = (slice(i, j) for i, j in zip(np.cumsum((0, *counts[:-1])), np.cumsum(counts), strict=True))
     part = lambda tree, cut: tree._replace(
         **{k: getattr(tree, k)[cut] for k in tree._fields if k not in ("slopes", "spins")}
@@ -174,23 +186,28 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array) -> Foun
             choice.stout(fine.theta[s][:, 3]),
         ]
     )
-    score = jnp.where(good, score, jnp.inf)
-    score = score - jnp.concatenate([jnp.full(counts[0], choice.PLANE_BONUS), jnp.zeros(sum(counts[1:]))]).astype(dtype)
+    bonus = jnp.concatenate([jnp.full(counts[0], choice.PLANE_BONUS), jnp.zeros(sum(counts[1:]))]).astype(dtype)
+    score = jnp.where(jnp.isfinite(score), score, 1e9) - bonus
     # Free narrowing makes a body of revolution a cone.
     kind = jnp.concatenate(
         [jnp.full(counts[0], 0), jnp.full(counts[1], 1), jnp.where(steep, 3, 2), jnp.full(counts[3], 4)]
     )
-    table = jnp.where(kind[None] == jnp.arange(5)[:, None], score[None], jnp.inf)
-    best = jnp.argmin(table, -1)
-    scores = jnp.where(allowed, table.min(-1), jnp.inf)
+    own = kind[None] == jnp.arange(5)[:, None]
+    # The best that passes, or where none does the best of those.
+    best = jnp.argmin(jnp.where(own, score + jnp.where(good, 0.0, 1e12), jnp.inf), -1)
+    passed = good[best] & allowed
+    scores = score[best]
     chosen = Candidates(*(c[best] for c in fine))
     return Found(
-        jnp.argmin(scores),
-        scores * view.mask.sum() / count,
-        chosen,
-        mixed.scale[best],
-        mixed.background[best],
-        deviation,
+        kind=jnp.argmin(jnp.where(passed, scores, jnp.inf)),
+        passed=passed,
+        scores=scores * view.mask.sum() / count,
+        candidates=chosen,
+        scale=mixed.scale[best],
+        background=mixed.background[best],
+        deviation=deviation,
+        local=typical / deviation,
+        normals=jnp.where(patches.usable[:, None], patches.normal, 0.0),
     )
 
 

@@ -1,24 +1,33 @@
-"""From the points of an object to its shape: hypotheses, choice, batch."""
+"""From the points of an object to its shape: its kind, its size, how sure that is; many objects in one compiled batch.
 
-from functools import partial
-from typing import Any, NamedTuple
+The engine is a fuzzy variety beside a noise cluster (see `search`), its residual taken along the viewing ray where the camera is
+known: stereo errs along the ray alone, so a surface should predict one depth a ray, its first hit that faces the camera.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from jaxfuzzy import bounds, checks, polish, rays, search
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, as_float, record, static
+from jaxfuzzy import bounds, checks
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
+from jaxfuzzy.fitting import TOLERANCES, Fitted, assemble_batch
+from jaxfuzzy.looks import Look, Settings, look_at, unfit
+from jaxfuzzy.objects import COUNTS, DEVIATIONS, Frame, padded, prepared
 from jaxfuzzy.primitives import Primitive
+from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
-KINDS = search.KINDS
-# A noise distance is so many standard deviations; residuals are searched and weighed in deviations.
-DEVIATIONS = 2.5
-FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
-FEWEST = 12
-CAPACITIES = (256, 512, 1024, 2048)
+# Nats of margin below which the next kind is nearly as good.
+NARROW = 10.0
+GUARDS = {
+    "plane": "not tried",
+    "box": "a face holds too few of the points within its extent",
+    "cylinder": "its radius is next to nothing, or so large that it is flat",
+    "cone": "it does not taper by a quarter, or its radius is out of range",
+    "sphere": "its radius is next to nothing, or so large that it is flat",
+}
 
 
 @record
@@ -31,10 +40,11 @@ class Shape:
         inliers: Which of the object's points lie on it.
         noise_distance: The noise distance used, in metres (the median where it differs from point to point).
         scores: Score of every kind tried, lower is better.
-        margin: Score of the second best less that of the best.
+        margin: Score of the second best less that of the best, of those no guard spoke against.
         counts: Inliers in each embedding, where the paper's rule was asked for.
         covariance: Of `primitive.parameters()`.
         status: Reasons to read this with care; see `describe`.
+        guards: Kinds that a guard spoke against, whatever their score, and why.
     """
 
     primitive: Primitive | None
@@ -46,216 +56,246 @@ class Shape:
     covariance: Float[Array, "P P"]
     status: Int[Array, ""]
     kind: str = static()
+    guards: tuple[str, ...] = static(default=())
 
 
-def fit_shape(points: Float[ArrayLike, "N 3"], **options: Any) -> Shape:
-    """Names and fits the shape of one object. See `fit_shapes` for the options."""
+def fit_shape(
+    points: Float[ArrayLike, "N 3"],
+    *,
+    noise_distance: Literal["auto"] | ArrayLike = "auto",
+    kinds: Sequence[str] = KINDS,
+    up: ArrayLike = (0.0, 1.0, 0.0),
+    camera: ArrayLike | None = None,
+    distance: Literal["ray", "geometric", "algebraic"] | None = None,
+    rule: Literal["likelihood", "gric", "paper"] = "likelihood",
+    weights: ArrayLike | None = None,
+) -> Shape:
+    """Names and fits the shape of one object.
+
+    Args:
+        points: Its points (N, 3) in metres, outliers among them.
+        noise_distance: How far a point may lie from the surface and still belong to it, in metres: two and a half standard
+            deviations, for all points or for each (N,), along the viewing ray where that is known. "auto": the deviation is read
+            from the residuals of small windows, growing with the square of the distance from a known camera, and then
+            from those of the surface found.
+        kinds: Kinds to choose from. What fits none is "quadric" or "unknown".
+        up: The vertical direction, near which axes are looked for; its sign may be either.
+        camera: Where the points were seen from (3,), in their own frame.
+        distance: "ray", along the viewing ray (the default with a camera); "geometric", orthogonal (without); "algebraic", the
+            paper's, in the embedding.
+        rule: "likelihood" of surface noise against background less a price per parameter; "gric", Torr's criterion; "paper", most
+            points in 3D, 4D or 6D.
+        weights: Weight of each point (N,).
+
+    Returns:
+        The shape. It is "unknown" with a status where the data do not tell.
+
+    Raises:
+        ValueError: An argument out of range or of wrong shape.
+        TypeError: An argument of wrong kind.
+    """
     array = checks.points(points, dims=3)
-    return fit_shapes(array, np.zeros(len(array), int), **options)[0]
+    return fit_shapes(
+        array,
+        np.zeros(len(array), int),
+        noise_distance=noise_distance,
+        kinds=kinds,
+        up=up,
+        camera=camera,
+        distance=distance,
+        rule=rule,
+        weights=weights,
+    )[0]
 
 
 def fit_shapes(
     points: Float[ArrayLike, "N 3"],
     labels: Int[ArrayLike, " N"],
     *,
-    noise_distance: Any = "auto",
-    kinds: tuple[str, ...] = KINDS,
+    noise_distance: Literal["auto"] | ArrayLike = "auto",
+    kinds: Sequence[str] = KINDS,
     up: ArrayLike = (0.0, 1.0, 0.0),
     camera: ArrayLike | None = None,
-    distance: str | None = None,
-    rule: str = "likelihood",
+    distance: Literal["ray", "geometric", "algebraic"] | None = None,
+    rule: Literal["likelihood", "gric", "paper"] = "likelihood",
     weights: ArrayLike | None = None,
 ) -> tuple[Shape, ...]:
-    """Names and fits the shapes of all objects of a scene in one compiled batch."""
+    """Names and fits the shapes of all objects of a scene in one compiled batch.
+
+    Args:
+        points: Points (N, 3) of all objects in metres.
+        labels: The object of each point (N,), 0, 1, ...; -1 is left out.
+        noise_distance: As in `fit_shape`.
+        kinds: As in `fit_shape`.
+        up: As in `fit_shape`.
+        camera: As in `fit_shape`.
+        distance: As in `fit_shape`.
+        rule: As in `fit_shape`.
+        weights: As in `fit_shape`.
+
+    Returns:
+        One shape a label, in the order of the labels.
+
+    Raises:
+        ValueError: An argument out of range or of wrong shape.
+        TypeError: An argument of wrong kind.
+    """
     array = checks.points(points, dims=3)
-    label = checks.labels(labels, len(array))
-    dtype = array.dtype
-    p = np.asarray(array, np.float64)
-    delta = None if isinstance(noise_distance, str) else np.broadcast_to(np.asarray(noise_distance, float), len(p))
-    upward = checks.direction(up, "up")
-    eye = None if camera is None else np.asarray(camera, float)
-    use_rays = eye is not None and distance in (None, "ray")
+    count = len(array)
+    label = checks.labels(labels, count)
+    delta = _noise(noise_distance, count)
+    kinds = _kinds(kinds)
+    vertical = checks.direction(up, "up")
+    eye = None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), float)[0]
+    distance = checks.choice(
+        distance or ("geometric" if eye is None else "ray"), "distance", ("ray", "geometric", "algebraic")
+    )
+    checks.choice(rule, "rule", ("likelihood", "gric", "paper"))
+    if distance == "ray" and eye is None:
+        raise ValueError("camera must be given with distance='ray', got None")
+    weight = checks.weights(weights, count)
+    p = np.asarray(array, float)
+    w = np.ones(count) if weight is None else np.asarray(weight, float)
+    along_ray = distance == "ray"
     members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
-    objects = [_prepared(p[m], None if delta is None else delta[m], upward, eye, use_rays) for m in members]
-    capacity = next((c for c in CAPACITIES if c >= max(map(len, members))), None) or 1 << int(
-        np.ceil(np.log2(max(map(len, members))))
-    )
-    count = 1 << int(np.ceil(np.log2(len(objects))))
-    batch = _stacked(objects, capacity, count, dtype)
-    allowed = jnp.asarray([k in kinds for k in KINDS])
-    fitted = jax.tree.map(np.asarray, _solve(batch, allowed, use_rays))
-    return tuple(_shape(o, m, i, fitted, kinds, dtype) for i, (o, m) in enumerate(zip(objects, members, strict=True)))
+    objects = [
+        prepared(p[m], w[m], None if delta is None else delta[m] / DEVIATIONS, vertical, eye, along_ray)
+        if len(m)
+        else None
+        for m in members
+    ]
+    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype)
+    poor = [unfit(o) for o in objects]
+    fit = [i for i, status in enumerate(poor) if not status]
+    looks = dict(zip(fit, look_at([o for o in objects if not unfit(o)], settings), strict=True))
+    return _shapes(looks, poor, [len(m) for m in members], settings)
 
 
-class _Object(NamedTuple):
-    """One object ready for the kernel: points in its own frame, in the order in which they are sampled."""
-
-    points: np.ndarray
-    order: np.ndarray
-    gain: np.ndarray
-    eye: np.ndarray
-    depth_range: float
-    given: bool
-    frame: bounds.Frame
+def _noise(value: Any, count: int) -> np.ndarray | None:
+    """Noise distance of each point (N,); None for "auto"."""
+    if isinstance(value, str):
+        checks.choice(value, "noise_distance", ("auto",))
+        return None
+    if value is None:
+        raise TypeError("noise_distance must be 'auto', a number, or an array (N,), got None")
+    return np.broadcast_to(np.asarray(checks.noise_distance(value, count), float), count)
 
 
-def _prepared(
-    p: np.ndarray, delta: np.ndarray | None, up: np.ndarray, camera: np.ndarray | None, use_rays: bool
-) -> _Object:
-    middle = p.mean(0)
-    if camera is not None and (camera - middle) @ up < 0:
-        up = -up
-    # A horizontal direction that points away from the camera becomes z.
-    forward = middle - camera if use_rays and camera is not None else np.eye(3)[np.argmin(np.abs(up))]
-    forward = forward - up * (up @ forward)
-    if np.linalg.norm(forward) < 1e-9 * np.linalg.norm(middle) + 1e-30:
-        forward = np.eye(3)[np.argmin(np.abs(up))]
-        forward = forward - up * (up @ forward)
-    forward /= np.linalg.norm(forward)
-    turn = np.stack([np.cross(up, forward), up, forward])
-    offset = (p - middle) @ turn.T
-    unit = float(np.sqrt((offset**2).sum(1).mean()))
-    unit = unit if unit > 0 else 1.0
-    q = offset / unit
-    # Sorted by height and then spread by the golden ratio, any beginning is a fair sample, whatever order points came in.
-    order = np.lexsort((q[:, 2], q[:, 0], q[:, 1]))
-    order = order[np.argsort((np.arange(len(p)) * 0.6180339887498949) % 1.0, kind="stable")]
-    if use_rays and camera is not None:
-        eye = turn @ (camera - middle) / unit
-        away = np.linalg.norm(q - eye, axis=1)
-        relative = (away / away.mean()) ** 2
-        depth_range = float(np.ptp(away))
-    else:
-        eye, relative = np.zeros(3), np.ones(len(p))
-        depth_range = float(np.ptp(q, axis=0).min())
-    deviation = relative if delta is None else delta / DEVIATIONS / unit
-    return _Object(
-        points=q[order],
-        order=order,
-        gain=1 / deviation[order],
-        eye=eye,
-        depth_range=max(depth_range, 1e-6),
-        given=delta is not None,
-        frame=bounds.Frame(turn, middle, np.asarray(unit)),
-    )
+def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(kinds, str):
+        raise TypeError(f"kinds must be several names, got the string {kinds!r}")
+    if not kinds:
+        raise ValueError(f"kinds must name one of {', '.join(map(repr, KINDS))} at least, got none")
+    return tuple(checks.choice(k, "kinds", KINDS) for k in kinds)
 
 
-def _stacked(objects: list[_Object], capacity: int, count: int, dtype: Any) -> dict[str, np.ndarray]:
-    batch = {
-        "points": np.zeros((count, capacity, 3), dtype),
-        "gain": np.ones((count, capacity), dtype),
-        "mask": np.zeros((count, capacity), dtype),
-        "eye": np.full((count, 3), -5.0, dtype),
-        "depth_range": np.ones(count, dtype),
-        "given": np.ones(count, bool),
-    }
-    for i, o in enumerate(objects):
-        n = len(o.points)
-        batch["points"][i, :n], batch["gain"][i, :n], batch["mask"][i, :n] = o.points, o.gain, 1
-        batch["eye"][i], batch["depth_range"][i], batch["given"][i] = o.eye, o.depth_range, o.given
-    return batch
+def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
+    """Shapes of all objects; primitives of one kind are made together."""
+    good = {i: look for i, look in looks.items() if not look.reason}
+    made: dict[int, tuple[Primitive, np.ndarray]] = {}
+    ends = {i: _ends(look) for i, look in good.items()}
+    for kind in KINDS:
+        made |= _assembled(kind, {i: o for i, o in good.items() if KINDS[o.fitted.kind] == kind}, ends, settings.dtype)
+    shapes = []
+    for i, size in enumerate(sizes):
+        if i in made:
+            shapes.append(_shape(looks[i], *made[i], settings))
+        else:
+            status = poor[i] or looks[i].reason
+            shapes.append(_unknown(size, looks.get(i), Status(status), settings))
+    return tuple(jax.device_put(shapes))
 
 
-class _Fitted(NamedTuple):
-    kind: Array
-    scores: Array
-    detail: Array
-    noise: Array
-    polished: polish.Polished
+def _on(look: Look) -> np.ndarray:
+    """Which points lie on the surface, in the order of the search: those whose noise membership is not the larger."""
+    scale = 1.0 if look.item.given else float(look.fitted.polished.scale)
+    n = len(look.item.points)
+    return (look.fitted.polished.square[:n] <= (DEVIATIONS * scale) ** 2) & (look.item.weight > 0)
 
 
-@partial(jax.jit, static_argnames="use_rays")
-def _solve(batch: dict[str, Array], allowed: Array, use_rays: bool) -> _Fitted:
-    def one(item: dict[str, Array]) -> _Fitted:
-        view = _view(item, use_rays)
-        small = jax.tree.map(lambda a: a.astype(jnp.float32), view)
-        found = search.search(small, item["depth_range"].astype(jnp.float32), allowed, item["given"])
-        dtype = view.gain.dtype
-        deviation = found.deviation.astype(dtype)
-        take = lambda a: a[found.kind].astype(dtype)
-        polished = polish.polish(
-            jnp.asarray(FAMILIES)[found.kind],
-            jax.tree.map(take, found.candidates),
-            view._replace(gain=view.gain / deviation),
-            take(found.scale),
-            take(found.background),
-            item["depth_range"],
-            (0.2, 2.0),
-            1e-9 if dtype == jnp.float64 else 1e-5,
+def _ends(look: Look) -> np.ndarray:
+    item, polished = look.item, look.fitted.polished
+    n = len(item.points)
+    direction = item.points - item.eye
+    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True) if item.eye.any() else 0.0
+    hits = (item.points + polished.depth[:n, None] * direction) @ polished.turn.T
+    kind = KINDS[look.fitted.kind]
+    return bounds.ends_of(kind, polished.theta, hits, polished.part[:n], _on(look), look.fitted.detail)
+
+
+def _assembled(
+    kind: str, looks: dict[int, Look], ends: dict[int, np.ndarray], dtype: Any
+) -> dict[int, tuple[Primitive, np.ndarray]]:
+    """Primitives and their covariances."""
+    if not looks:
+        return {}
+    chosen = list(looks)
+    # Padded by repetition to a few sizes, so that few are compiled.
+    rows = chosen + [chosen[0]] * (padded(len(chosen), COUNTS) - len(chosen))
+    stack = lambda of: np.stack([np.asarray(of(i), dtype) for i in rows])
+    frame = Frame(*(stack(lambda i, f=f: getattr(looks[i].item.frame, f)) for f in Frame._fields))
+    polished = lambda name: stack(lambda i: getattr(looks[i].fitted.polished, name))
+    primitives, covariances = jax.device_get(
+        assemble_batch(
+            kind,
+            polished("theta"),
+            polished("covariance"),
+            polished("turn"),
+            stack(lambda i: looks[i].fitted.detail),
+            stack(lambda i: ends[i]),
+            frame,
         )
-        return _Fitted(found.kind, found.scores, take(found.candidates.detail), deviation, polished)
-
-    return lax.map(one, batch)
-
-
-def _view(item: dict[str, Array], use_rays: bool) -> rays.View:
-    p, gain, mask = item["points"], item["gain"], item["mask"]
-    point = tuple(p[:, i][None] for i in range(3))
-    if not use_rays:
-        return rays.View(point, None, None, gain, mask)
-    d = p - item["eye"]
-    d = d / jnp.sqrt((d**2).sum(-1, keepdims=True))
-    return rays.View(
-        point, tuple(d[:, i][None] for i in range(3)), tuple(item["eye"][i][None, None] for i in range(3)), gain, mask
     )
+    return {i: (jax.tree.map(lambda a, j=j: a[j], primitives), covariances[j]) for j, i in enumerate(chosen)}
 
 
-@partial(jax.jit, static_argnames="kind")
-def _assemble(
-    kind: str, theta: Array, ends: Array, signs: Array, rotation: Array, frame: bounds.Frame, covariance: Array
-):
-    def parameters(x: Array) -> Array:
-        return build(x).parameters()
-
-    def build(x: Array) -> Primitive:
-        e = jnp.concatenate([x[7:].reshape(3, 2), ends[:, 2:]], 1)
-        return bounds.assembled(kind, x[:5], x[5:7], e, signs, rotation, frame)
-
-    x = jnp.concatenate([theta, jnp.zeros(2, theta.dtype), ends[:, :2].ravel()])
-    slope = jax.jacfwd(parameters)(x)
-    full = jnp.zeros((13, 13), theta.dtype).at[:7, :7].set(covariance)
-    full = full.at[jnp.arange(7, 13), jnp.arange(7, 13)].set(jnp.repeat(ends[:, 2] ** 2, 2))
-    return build(x), slope @ full @ slope.T
-
-
-def _shape(o: _Object, members: np.ndarray, i: int, fitted: _Fitted, kinds: tuple[str, ...], dtype: Any) -> Shape:
-    n = len(o.points)
-    polished = jax.tree.map(lambda a: a[i], fitted.polished)
-    kind = KINDS[int(fitted.kind[i])]
-    limit = DEVIATIONS * (1.0 if o.given else float(polished.scale))
-    on = polished.square[:n] <= limit**2
-    status = Status(0)
-    if n < FEWEST or on.sum() < FEWEST // 2:
-        status |= Status.TOO_FEW_POINTS
-    direction = o.points - o.eye
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    hits = (o.points + polished.depth[:n, None] * direction * bool(np.any(o.eye))) @ np.asarray(polished.turn).T
-    ends = bounds.ends_of(kind, polished.theta, hits, polished.part[:n], on, fitted.detail[i])
-    if kind == "plane":
-        status |= Status.MAY_BE_BOX
-    frame = jax.tree.map(lambda a: jnp.asarray(a, dtype), o.frame)
-    primitive, covariance = _assemble(
-        kind,
-        jnp.asarray(polished.theta),
-        jnp.asarray(ends, dtype),
-        jnp.asarray(fitted.detail[i], dtype),
-        jnp.asarray(polished.turn),
-        frame,
-        jnp.asarray(polished.covariance),
-    )
-    inliers = np.zeros(n, bool)
-    inliers[o.order] = on
-    scores = {k: float(s) for k, s in zip(KINDS, fitted.scores[i], strict=True) if k in kinds}
-    ranked = sorted(scores.values())
-    deviation = float(np.median(1 / o.gain)) * float(fitted.noise[i]) * float(o.frame.unit)
+def _shape(look: Look, primitive: Primitive, covariance: np.ndarray, settings: Settings) -> Shape:
+    item, fitted = look.item, look.fitted
+    kind = KINDS[fitted.kind]
+    inliers = np.zeros(len(item.points), bool)
+    inliers[item.order] = _on(look)
+    scores, margin, guards = _told(fitted, settings.kinds)
+    status = Status.MAY_BE_BOX if kind == "plane" else Status(0)
+    if margin < NARROW:
+        status |= Status.LOW_MARGIN
+    if fitted.polished.moved > TOLERANCES[np.dtype(settings.dtype)]:
+        status |= Status.NOT_CONVERGED
+    scale = 1.0 if item.given else float(fitted.polished.scale)
+    deviation = np.median(1 / item.gain) * fitted.deviation * item.frame.unit * scale
     return Shape(
         primitive=primitive,
-        inliers=jnp.asarray(inliers),
-        noise_distance=jnp.asarray(deviation * limit, dtype),
+        inliers=inliers,
+        noise_distance=np.asarray(DEVIATIONS * deviation, settings.dtype),
         scores=scores,
-        margin=ranked[1] - ranked[0] if len(ranked) > 1 else float("inf"),
+        margin=margin,
         counts={},
         covariance=covariance,
-        status=jnp.asarray(int(status)),
+        status=np.asarray(status, np.int32),
         kind=kind,
+        guards=guards,
+    )
+
+
+def _told(fitted: Fitted, kinds: tuple[str, ...]) -> tuple[dict[str, float], float, tuple[str, ...]]:
+    """Scores, margin, and the guards that spoke."""
+    scores = {k: float(s) for k, s in zip(KINDS, fitted.scores, strict=True) if k in kinds}
+    passed = {k for k, good in zip(KINDS, fitted.passed, strict=True) if good}
+    ranked = sorted(score for k, score in scores.items() if k in passed)
+    margin = ranked[1] - ranked[0] if len(ranked) > 1 else float("inf")
+    return scores, margin, tuple(f"{k}: {GUARDS[k]}" for k in scores if k not in passed)
+
+
+def _unknown(size: int, look: Look | None, status: Status, settings: Settings) -> Shape:
+    scores, margin, guards = ({}, 0.0, ()) if look is None else _told(look.fitted, settings.kinds)
+    return Shape(
+        primitive=None,
+        inliers=np.zeros(size, bool),
+        noise_distance=np.asarray(np.nan, settings.dtype),
+        scores=scores,
+        margin=margin,
+        counts={},
+        covariance=np.zeros((0, 0), settings.dtype),
+        status=np.asarray(status, np.int32),
+        kind="unknown",
+        guards=guards,
     )

@@ -1,0 +1,122 @@
+"""The compiled part of shape fitting: a padded batch of objects in, the best surface of each out; and bounded primitives."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxfuzzy import bounds, polish, rays, search
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.objects import Frame
+from jaxfuzzy.primitives import Primitive
+
+FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
+# Noise of a surface in units of the points' deviation may be found to be so small or large.
+SCALES = (0.2, 4.0)
+# A surface stands still when nothing moves by more, in units of the object's spread.
+TOLERANCES = {jnp.dtype(jnp.float32): 1e-5, jnp.dtype(jnp.float64): 1e-9}
+
+
+class Fitted(NamedTuple):
+    """The best surface of each object.
+
+    Attributes:
+        kind: Index of its kind.
+        scores: Score of every kind (5,).
+        passed: Whether it is allowed and no guard speaks against it (5,).
+        detail: Signs of a box, ends of a body of revolution (3,).
+        deviation: Factor found for deviations that were not given, else 1.
+        local: What small windows say of the points' deviation, in units of that used.
+        normals: Normals of small pieces of surface, in the object's frame (W, 3), 0 where unusable.
+        polished: The surface on all points.
+    """
+
+    kind: Array
+    scores: Array
+    passed: Array
+    detail: Array
+    deviation: Array
+    local: Array
+    normals: Array
+    polished: polish.Polished
+
+
+@partial(jax.jit, static_argnames="along_ray")
+def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: bool) -> Fitted:
+    """Fits all objects of a padded batch, one after the other; padding costs nothing.
+
+    Args:
+        batch: As `objects.stacked` makes it.
+        allowed: Which kinds may be chosen (5,).
+        gric: Whether to score by GRIC in place of the likelihood.
+        along_ray: Whether residuals are along the viewing ray.
+    """
+
+    def one(item: dict[str, Array]) -> Fitted:
+        view = _view(item, along_ray)
+        dtype = view.gain.dtype
+        # Searching in single precision is enough for any dtype: the winner is polished in the input's own.
+        small = jax.tree.map(lambda a: a.astype(jnp.float32), view)
+        found = search.search(small, item["depth_range"].astype(jnp.float32), allowed, item["given"], gric)
+        take = lambda a: a[found.kind].astype(dtype)
+        polished = polish.polish(
+            jnp.asarray(FAMILIES)[found.kind],
+            jax.tree.map(take, found.candidates),
+            view._replace(gain=view.gain / found.deviation.astype(dtype)),
+            take(found.scale),
+            take(found.background),
+            item["depth_range"],
+            SCALES,
+            TOLERANCES[dtype],
+        )
+        return Fitted(
+            found.kind,
+            found.scores,
+            found.passed,
+            take(found.candidates.detail),
+            found.deviation.astype(dtype),
+            found.local,
+            found.normals,
+            polished,
+        )
+
+    def empty(item: dict[str, Array]) -> Fitted:
+        return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(one, item))
+
+    return lax.map(lambda item: lax.cond(item["weight"].sum() > 0, one, empty, item), batch)
+
+
+def _view(item: dict[str, Array], along_ray: bool) -> rays.View:
+    p, gain, mask = item["points"], item["gain"], item["weight"]
+    point = tuple(p[:, i][None] for i in range(3))
+    if not along_ray:
+        return rays.View(point, None, None, gain, mask)
+    d = p - item["eye"]
+    d = d / jnp.sqrt((d**2).sum(-1, keepdims=True))
+    eye = tuple(item["eye"][i][None, None] for i in range(3))
+    return rays.View(point, tuple(d[:, i][None] for i in range(3)), eye, gain, mask)
+
+
+@partial(jax.jit, static_argnames="kind")
+def assemble_batch(
+    kind: str, theta: Array, covariance: Array, turn: Array, detail: Array, ends: Array, frame: Frame
+) -> tuple[Primitive, Array]:
+    """Bounded primitives of one kind in metres, and the covariance of their parameters; every argument has a leading axis."""
+
+    def one(
+        theta: Array, covariance: Array, turn: Array, detail: Array, ends: Array, frame: Frame
+    ) -> tuple[Primitive, Array]:
+        def build(x: Array) -> Primitive:
+            moved = jnp.concatenate([x[7:].reshape(3, 2), ends[:, 2:]], 1)
+            return bounds.assembled(kind, x[:5], x[5:7], moved, detail, turn, frame)
+
+        x = jnp.concatenate([theta, jnp.zeros(2, theta.dtype), ends[:, :2].ravel()])
+        slope = jax.jacfwd(lambda x: build(x).parameters())(x)
+        errors = jnp.repeat(ends[:, 2] ** 2, 2)
+        full = jnp.zeros((13, 13), theta.dtype).at[:7, :7].set(covariance)
+        full = full.at[jnp.arange(7, 13), jnp.arange(7, 13)].set(errors)
+        return build(x), slope @ full @ slope.T
+
+    return jax.vmap(one)(theta, covariance, turn, detail, ends, frame)
