@@ -1,24 +1,22 @@
 """How well the stereo stage matches: real pairs with ground truth beside bare OpenCV, rendered pairs, a calibration.
 
-    python benchmarks/stereo.py [--data FOLDER] [--out FILE]
+    python benchmarks/stereo.py [--data FOLDER] [--only PART ...]
 
-Prints a table a question and writes every figure as JSON. A pixel is answered where a disparity is given; cover is the
-share of pixels with known truth that are answered, bad-2 the share of those that are wrong by more than 2 px, deviation
-the robust standard deviation of the error. Times are of this run on this machine; only their ratios mean something.
+Prints a table a question and writes every figure to benchmarks/results/stereo.json. A pixel is answered where a disparity
+is given; cover is the share of pixels with known truth that are answered, bad-2 the share of those that are wrong by more
+than 2 px, deviation the robust standard deviation of the error, pixels a point how many neighboring pixels make one
+independent measurement. Times are of this run on this machine; only their ratios mean something.
 """
 
 import argparse
 import contextlib
-import json
-import platform
-import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from common import provenance, table, timings, write
 
 from jaxfuzzy.calibrate import calibrate
 from jaxfuzzy.checks import DataError
@@ -29,7 +27,6 @@ from jaxfuzzy.reproject import measure_noise
 from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.stereo import disparity, reconstruct
 
-ROOT = Path(__file__).parents[1]
 # folder, left, right, truth, what its numbers are divided by, disparities for bare OpenCV (which must be told)
 SCENES = {
     "cones": ("middlebury2003_cones", "im2.png", "im6.png", "disp2.png", 4, 64),
@@ -44,7 +41,7 @@ SCENES = {
     "jadeplant": ("middlebury2014_jadeplant_quarter", "im0.png", "im1.png", "disp0GT.pfm", 1, 160),
     "adirondack": ("middlebury2014_adirondack_quarter", "im0.png", "im1.png", "disp0GT.pfm", 1, 80),
     "motorcycle": ("skimage_motorcycle", "motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz", 1, 80),
-    "aloe": ("opencv_aloe", "aloeL.jpg", "aloeR.jpg", "aloeGT.png", 1, 224),
+    "aloe (truth in whole px)": ("opencv_aloe", "aloeL.jpg", "aloeR.jpg", "aloeGT.png", 1, 224),
 }
 SETTINGS: dict[str, Matcher | None] = {
     "bare OpenCV": None,
@@ -54,15 +51,7 @@ SETTINGS: dict[str, Matcher | None] = {
     "hh": Matcher(method="hh"),
     "bm": Matcher(method="bm"),
 }
-
-
-def best_of(call: Callable[[], Any], repeats: int = 3) -> tuple[Any, float]:
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = call()
-        times.append(time.perf_counter() - start)
-    return result, min(times)
+FIGURES = ("cover", "bad2", "bad1", "median_px", "deviation_px", "bias_px", "pixels_a_point")
 
 
 def bare(left: np.ndarray, right: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -84,46 +73,42 @@ def judged(values: Any, valid: Any, truth: np.ndarray) -> dict[str, float]:
         "bias_px": np.median(error),
     }
     with contextlib.suppress(DataError):  # too few pixels to tell
-        figures["pixels_per_point"] = measure_noise(values, answered, truth_px=truth).pixels_per_point
+        figures["pixels_a_point"] = measure_noise(values, answered, truth_px=truth).pixels_per_point
     return {name: round(float(value), 4) for name, value in figures.items()}
 
 
-def rig_of(folder: Path, left: np.ndarray) -> Rig:
-    size = (left.shape[1], left.shape[0])
-    # Three sets have no calibration; matching needs none beyond the size.
-    return load_rig(folder / "calib.txt") if (folder / "calib.txt").exists() else Rig((1000, 1000), (0, 0), 0.1, size)
+def line(figures: dict[str, float]) -> list[float | str]:
+    return [figures.get(name, "") for name in FIGURES]
 
 
-def real_pairs(data: Path) -> dict[str, Any]:
-    print(f"{'scene':12}{'setting':14}{'cover':>7}{'bad-2':>8}{'bad-1':>8}{'median':>8}{'dev.':>7}{'px/pt':>7}{'s':>7}")
+def matching(data: Path) -> dict[str, Any]:
     results: dict[str, Any] = {}
     for scene, (name, left_name, right_name, truth_name, scale, count) in SCENES.items():
         folder = data / name
         truth = read_disparity(folder / truth_name, scale=scale)
         left, right = (cv2.imread(str(folder / image)) for image in (left_name, right_name))
-        rig = rig_of(folder, left)
-        results[scene] = {}
-        for setting, matcher in SETTINGS.items():
-            if matcher is None:
-                (values, valid), seconds = best_of(lambda l=left, r=right, n=count: bare(l, r, n))
-            else:
-                (values, valid), seconds = best_of(
-                    lambda l=left, r=right, g=rig, m=matcher: disparity(l, r, g, matcher=m)
-                )
-            row = judged(values, valid, truth) | {"seconds": round(seconds, 3)}
-            results[scene][setting] = row
-            print(
-                f"{scene:12}{setting:14}{row['cover']:7.3f}{row['bad2']:8.4f}{row['bad1']:8.4f}{row['median_px']:8.3f}"
-                f"{row['deviation_px']:7.3f}{row.get('pixels_per_point', np.nan):7.1f}{row['seconds']:7.3f}"
+        # Three sets have no calibration; matching needs none beyond the size.
+        plain = Rig((1000, 1000), (0, 0), 0.1, (left.shape[1], left.shape[0]))
+        rig = load_rig(folder / "calib.txt") if (folder / "calib.txt").exists() else plain
+        results[scene] = {
+            setting: judged(
+                *(bare(left, right, count) if matcher is None else disparity(left, right, rig, matcher=matcher)), truth
             )
-    print(f"\n{'mean of all':12}")
-    for setting in SETTINGS:
-        means = {
-            name: float(np.mean([results[scene][setting][name] for scene in results]))
-            for name in ("cover", "bad2", "bad1", "median_px", "deviation_px")
+            for setting, matcher in SETTINGS.items()
         }
-        print(f"{'':12}{setting:14}" + "  ".join(f"{name} {value:.4f}" for name, value in means.items()))
-    return results
+        table(scene, ("setting", *FIGURES), [(setting, *line(row)) for setting, row in results[scene].items()])
+    means = {
+        setting: {name: float(np.mean([rows[setting][name] for rows in results.values()])) for name in FIGURES}
+        for setting in SETTINGS
+    }
+    table("Mean of these scenes", ("setting", *FIGURES), [(setting, *line(row)) for setting, row in means.items()])
+    for setting in ("unchecked", "default"):
+        for figure, sign in (("cover", 1), ("bad2", -1)):
+            worse = [
+                s for s, rows in results.items() if sign * (rows[setting][figure] - rows["bare OpenCV"][figure]) < 0
+            ]
+            print(f"{setting}: {figure} worse than bare OpenCV's on {', '.join(worse) or 'no scene'}")
+    return results | {"mean": means}
 
 
 def full_size(data: Path) -> dict[str, Any]:
@@ -132,43 +117,42 @@ def full_size(data: Path) -> dict[str, Any]:
     rig = load_rig(folder / "calib.txt")
     left, right = read_pair(folder / "im2.png", folder / "im6.png", rig)
     small = read_disparity(data / "middlebury2003_cones" / "disp2.png", scale=4)
-    truth = 4 * cv2.resize(small, (1800, 1500), interpolation=cv2.INTER_NEAREST)
+    truth = 4 * cv2.resize(small, (left.shape[1], left.shape[0]), interpolation=cv2.INTER_NEAREST)
     # Enlarged truth is a staircase: only where its neighbors agree is it known to a pixel.
-    flat = cv2.dilate(np.nan_to_num(truth), np.ones((9, 9))) - cv2.erode(np.nan_to_num(truth), np.ones((9, 9))) <= 2
-    truth = np.where(flat, truth, np.float32(np.nan))
-    results = {}
-    for setting in ("default", "unrefined"):
-        values, valid = disparity(left, right, rig, matcher=SETTINGS[setting])
-        results[setting] = judged(values, valid, truth)
-        print(f"cones_full  {setting:14}" + "  ".join(f"{name} {value}" for name, value in results[setting].items()))
+    known, around = np.nan_to_num(truth), np.ones((9, 9), np.uint8)
+    truth = np.where(cv2.dilate(known, around) - cv2.erode(known, around) <= 2, truth, np.float32(np.nan))
+    results = {
+        setting: judged(*disparity(left, right, rig, matcher=SETTINGS[setting]), truth)
+        for setting in ("default", "unrefined")
+    }
+    table("cones, full size", ("setting", *FIGURES), [(setting, *line(row)) for setting, row in results.items()])
     return results
 
 
-def rendered(seeds: int = 20) -> dict[str, Any]:
+def rendered(_: Path, seeds: int = 20) -> dict[str, Any]:
     """Random tables, camera tilted by 0 to 35 degrees: exact truth."""
-    rows, objects, started, rendering = [], [], time.perf_counter(), 0.0
+    whole, objects, seconds = [], [], []
     for seed in range(seeds):
-        start = time.perf_counter()
-        picture = render_pair(table_scene(seed, tilt=np.deg2rad(35 * seed / max(seeds - 1, 1))), seed=seed)
-        rendering += time.perf_counter() - start
+        begin = time.perf_counter()
+        picture = render_pair(table_scene(seed, tilt=np.deg2rad(35 * seed / (seeds - 1))), seed=seed)
+        seconds.append(time.perf_counter() - begin)
         values, valid = map(np.asarray, disparity(picture.left, picture.right, picture.rig))
         truth = np.where(picture.visible, picture.disparity_px, np.nan)
-        rows.append(judged(values, valid, truth))
+        whole.append(judged(values, valid, truth))
         objects.append(judged(values, valid, np.where(picture.labels >= 0, truth, np.nan)))
-    out: dict[str, Any] = {
-        "pairs": seeds,
-        "seconds_rendering_a_pair": round(rendering / seeds, 3),
-        "seconds": round(time.perf_counter() - started, 1),
-    }
-    for name, table in (("everything", rows), ("objects", objects)):
-        out[name] = {key: round(float(np.mean([row[key] for row in table])), 4) for key in rows[0] if key in table[0]}
-        print(f"rendered    {name:14}" + "  ".join(f"{key} {value}" for key, value in out[name].items()))
-    print(f"rendered    {seeds} pairs, {out['seconds_rendering_a_pair']} s to render one")
+    out: dict[str, Any] = {"pairs": seeds, "seconds_to_render_a_pair": round(float(np.median(seconds)), 3)}
+    for name, rows in (("everything", whole), ("objects", objects)):
+        out[name] = {key: float(np.mean([row[key] for row in rows if key in row])) for key in FIGURES}
+    table(
+        f"{seeds} rendered pairs, {out['seconds_to_render_a_pair']} s to render one",
+        ("pixels", *FIGURES),
+        [(name, *line(out[name])) for name in ("everything", "objects")],
+    )
     return out
 
 
-def timing(data: Path) -> dict[str, Any]:
-    """Images to points, in units of one run of bare SGBM with its disparities given (3 ways, blocks of 5)."""
+def duration(data: Path) -> dict[str, Any]:
+    """Images to points, beside one run of SGBM that is told its disparities (three ways, blocks of 5)."""
     out = {}
     for scene, name, count in (("cones", "middlebury2003_cones", 64), ("cones_full", "middlebury2003_cones_full", 240)):
         rig = load_rig(data / name / "calib.txt")
@@ -176,10 +160,14 @@ def timing(data: Path) -> dict[str, Any]:
         single = cv2.StereoSGBM.create(
             minDisparity=0, numDisparities=count, blockSize=5, P1=600, P2=2400, mode=cv2.StereoSGBM_MODE_SGBM_3WAY
         )
-        _, one = best_of(lambda s=single, l=left, r=right: s.compute(l, r), 5)
-        _, whole = best_of(lambda l=left, r=right, g=rig: reconstruct(l, r, g), 5)
-        out[scene] = {"sgbm_s": round(one, 3), "reconstruct_s": round(whole, 3), "ratio": round(whole / one, 2)}
-        print(f"time        {scene:12} one SGBM {one:.3f} s, images to points {whole:.3f} s: {whole / one:.1f} times")
+        one = timings(lambda s=single, l=left, r=right: s.compute(l, r), 5)
+        whole = timings(lambda l=left, r=right, g=rig: reconstruct(l, r, g), 5)
+        out[scene] = {"one_sgbm": one, "images_to_points": whole, "ratio": round(whole["min"] / one["min"], 2)}
+    table(
+        "Seconds, fastest of five",
+        ("scene", "one SGBM", "images to points", "ratio"),
+        [(scene, row["one_sgbm"]["min"], row["images_to_points"]["min"], row["ratio"]) for scene, row in out.items()],
+    )
     return out
 
 
@@ -189,33 +177,29 @@ def calibration(data: Path) -> dict[str, Any]:
     rights = [path.with_name(path.name.replace("left", "right")) for path in lefts]
     found = calibrate(lefts, rights, square_m=1.0).calibration
     assert found is not None
-    print(
-        f"calibration {len(found.pairs)} of {len(lefts)} pairs, stereo rms {found.rms_px:.3f} px (OpenCV's sample 0.447)"
+    table(
+        "Calibration from OpenCV's own photographs (its sample settings give 13 pairs, 0.447 px)",
+        ("pairs", "of", "stereo rms px", "left rms px", "right rms px"),
+        [(len(found.pairs), len(lefts), found.rms_px, *found.mono_rms_px)],
     )
     return {"pairs": len(found.pairs), "of": len(lefts), "rms_px": found.rms_px, "pair_rms_px": found.pair_rms_px}
 
 
+PARTS = {
+    "matching": matching, "full_size": full_size, "rendered": rendered, "duration": duration, "calibration": calibration
+}  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the stereo pairs")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "stereo.json")
-    options = parser.parse_args()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    results = {
-        "machine": f"{platform.machine()}, {platform.processor() or platform.system()}, {cv2.getNumThreads()} threads",
-        "opencv": cv2.__version__,
-        "commit": commit.stdout.strip(),
-        "real": real_pairs(options.data),
-        "full_size": full_size(options.data),
-        "rendered": rendered(),
-        "time": timing(options.data),
-        "calibration": calibration(options.data),
-    }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(results, indent=1) + "\n")
-    print(f"wrote {options.out}")
+    default = Path(__file__).parents[2] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=default, help="folder of the stereo pairs")
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
+    args = parser.parse_args()
+    print(provenance())
+    results = {name: PARTS[name](args.data) for name in args.only}
+    if set(args.only) == set(PARTS):
+        write("stereo", results)
 
 
 if __name__ == "__main__":
