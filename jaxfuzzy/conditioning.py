@@ -9,7 +9,7 @@ from jaxfuzzy.embedding import padded_tables
 from jaxfuzzy.fcm import Partition, jacobian
 from jaxfuzzy.varieties import Varieties
 from jaxfuzzy.varietystep import jacobian as variety_jacobian
-from jaxfuzzy.varietystep import pose, prototypes
+from jaxfuzzy.varietystep import moments, pose, prototypes
 
 
 def conditioning(
@@ -58,7 +58,7 @@ def conditioning(
             ones,
             geometric=fit.distance == "geometric" and across == 1,
         )
-        theta = prototypes(task.m * jnp.log(one.memberships.T), task)
+        theta = prototypes(moments(ones * one.memberships.T**task.m, task), task)
         found.append(_smallest(variety_jacobian(theta, task)))
     return found[0] if isinstance(fit.embedding, str) else jnp.stack(found)
 

@@ -14,8 +14,8 @@ def alternate(x, v, m, steps=20_000):
     """Plain fuzzy c-means with the ratio form of the memberships, until no center moves by 1e-12 of the spread."""
     spread = np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean())
     for _ in range(steps):
-        d = ((x[:, None] - v[None]) ** 2).sum(axis=-1)
-        ratio = (d.min(axis=1, keepdims=True) / np.maximum(d, 1e-300)) ** (1 / (m - 1))
+        d = np.maximum(((x[:, None] - v[None]) ** 2).sum(axis=-1), 1e-30)
+        ratio = (d.min(axis=1, keepdims=True) / d) ** (1 / (m - 1))
         u = (ratio / ratio.sum(axis=1, keepdims=True)) ** m
         new = u.T @ x / u.sum(axis=0)[:, None]
         moved = np.abs(new - v).max()
