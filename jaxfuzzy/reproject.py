@@ -154,24 +154,25 @@ def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.n
         raise DataError(
             "no pixel is left: none is valid, finite and in front of the camera (some makers count disparities negative)"
         )
-    z = depth[rows, columns]
-    x = (columns - rig.center_px[0]) / rig.focal_px[0] * z
-    y = (rows - rig.center_px[1]) / rig.focal_px[1] * z
     dtype = depth.dtype
+    points = np.empty((len(rows), 3), dtype)
+    points[:, 2] = depth[valid]
+    for axis, places in enumerate((columns, rows)):
+        points[:, axis] = (places.astype(dtype) - rig.center_px[axis]) / rig.focal_px[axis] * points[:, 2]
     return Cloud(
-        points=jnp.asarray(np.stack([x, y, z], axis=1), dtype),
-        colors=None if image is None else _colors(image, rows, columns, depth.shape),
-        depth_std=jnp.asarray(std[rows, columns], dtype),
+        points=jnp.asarray(points),
+        colors=None if image is None else _colors(image, valid),
+        depth_std=jnp.asarray(std[valid], dtype),
         pixels_px=jnp.asarray(np.stack([columns, rows], axis=1), dtype),
         status=0 if rig.metric else int(Status.ARBITRARY_UNITS),
     )
 
 
-def _colors(image: Any, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> Array:
-    image = np.asarray(image)
+def _colors(image: Any, valid: np.ndarray) -> Array:
+    image, shape = np.asarray(image), valid.shape
     if image.dtype != np.uint8 or image.shape not in (shape, (*shape, 3)):
         raise ValueError(f"image must be uint8 of shape {shape} or {(*shape, 3)}, got {image.dtype} {image.shape}")
-    colors = image[rows, columns]
+    colors = image[valid]
     colors = np.repeat(colors[:, None], 3, axis=1) if colors.ndim == 1 else colors[:, ::-1]
     return jnp.asarray(colors.astype(np.float32) / 255)
 
