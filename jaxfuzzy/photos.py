@@ -18,6 +18,7 @@ Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
 
 SMALLEST = 32
 ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
+LEAST_SHARE = 0.2  # of matched features that must agree: real pairs 0.24 to 0.95, repeating patterns at wrong rows 0.15
 
 
 def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
@@ -188,7 +189,7 @@ def alignment(left: Image, right: Image) -> Alignment:
     held = np.searchsorted(rows, rows + 10) - np.arange(len(rows))
     middle = np.median(rows[held.argmax() :][: held.max()])
     good = moves[np.abs(moves[:, 1] - middle) <= 2.5 * shrink]
-    if len(good) < FEWEST_FEATURES:
+    if len(good) < max(FEWEST_FEATURES, LEAST_SHARE * len(moves)):
         return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
     across = np.percentile(good[:, 0], [5, 50, 95])
     return Alignment(

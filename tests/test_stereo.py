@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfuzzy.calibrate import calibrate
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.photos import alignment, read_disparity, read_pair, rectify
@@ -389,6 +390,18 @@ def test_rows_that_differ_are_measured_and_told(down, told):
     assert not found.swapped
     cloud = reconstruct(picture.left, picture.right, picture.rig)
     assert bool(cloud.status & Status.MISALIGNED) == told
+
+
+def test_nothing_is_said_about_rows_where_features_repeat(shared_data):
+    """A chessboard's corners match each other anywhere; rectified photographs of one are not called misaligned for that."""
+    folder = shared_data / "opencv_chessboard"
+    lefts = sorted(folder.glob("left[0-9]*.jpg"))
+    rights = [path.with_name(path.name.replace("left", "right")) for path in lefts]
+    rig = calibrate(lefts, rights, square_m=0.025)
+    for left, right in zip(lefts, rights, strict=True):
+        found = alignment(*rectify(left, right, rig)[:2])
+        assert abs(found.rows_px) < 0.5
+        assert not found.swapped
 
 
 def test_rows_far_apart_are_named_as_the_reason():
