@@ -86,7 +86,9 @@ def viewer(scene: "Scene", kept: slice) -> str:
     else:
         tones = np.rint(np.clip(np.asarray(scene.cloud.colors, float)[kept], 0, 1) * 255).astype(int)
         tones = tones @ np.array([1 << 16, 1 << 8, 1])
-    low, high = np.percentile(places, [1, 99], axis=0)
+    own = np.asarray(scene.segmentation.labels)[kept] >= 0
+    # Looks at the objects where there are any, else at everything.
+    low, high = np.percentile(places[own] if own.any() else places, [1, 99], axis=0)
     cloud = k3d.points(
         places,
         colors=tones.astype(np.uint32),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # Name of each figure of `figures`, and what it shows; numbers are those of the paper's figures.
 FIGURES = {
     "pair": "The stereo pair (paper's figure 3)",
-    "cloud": "The points found by stereo matching (figure 4)",
+    "cloud": "The points (figure 4)",
     "pca": "The objects from above with their principal axes (figure 5)",
     "histogram": "Histogram along the first principal axis, and the seeds it gives (figure 6)",
     "vrc": "Variance ratio over the number of clusters, and the paper's choice (figure 7)",

@@ -1,6 +1,7 @@
 """What the command line says: results on standard output, everything else in lines on standard error."""
 
 import contextlib
+import shutil
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -29,7 +30,9 @@ class Progress:
                 from tqdm import tqdm
 
                 form = "{desc:<24}{percentage:3.0f} % |{bar}| {elapsed}, {remaining} left"
-                self.bar = tqdm(total=1.0, bar_format=form, leave=False, file=sys.stderr, dynamic_ncols=True)
+                # Some terminals say that they have no columns and no rows; 80 by 24 are taken then.
+                wide, high = shutil.get_terminal_size()
+                self.bar = tqdm(total=1.0, bar_format=form, leave=False, file=sys.stderr, ncols=wide - 1, nrows=high)
         return self
 
     def __call__(self, stage: str, share: float) -> None:
