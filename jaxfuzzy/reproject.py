@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array
+from jaxfuzzy.arrays import Array, as_float
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.rig import Rig
@@ -160,10 +160,10 @@ def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.n
     for axis, places in enumerate((columns, rows)):
         points[:, axis] = (places.astype(dtype) - rig.center_px[axis]) / rig.focal_px[axis] * points[:, 2]
     return Cloud(
-        points=jnp.asarray(points),
+        points=as_float(points),
         colors=None if image is None else _colors(image, valid),
-        depth_std=jnp.asarray(std[valid], dtype),
-        pixels_px=jnp.asarray(np.stack([columns, rows], axis=1), dtype),
+        depth_std=as_float(std[valid].astype(dtype)),
+        pixels_px=as_float(np.stack([columns.astype(dtype), rows.astype(dtype)], axis=1)),
         status=0 if rig.metric else int(Status.ARBITRARY_UNITS),
     )
 
