@@ -3,6 +3,7 @@
 import contextlib
 import shutil
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -22,7 +23,9 @@ class Progress:
     """Stage and time left on standard error: a bar on a terminal where tqdm is installed, else one line a stage."""
 
     def __init__(self, quiet: bool) -> None:
-        self.quiet, self.bar, self.stage = quiet, None, ""
+        self.quiet, self.stage = quiet, ""
+        self.bar: Any = None
+        self.ended = threading.Event()
 
     def __enter__(self) -> "Progress":
         if not self.quiet and sys.stderr.isatty():
@@ -32,7 +35,16 @@ class Progress:
                 form = "{desc:<24}{percentage:3.0f} % |{bar}| {elapsed}, {remaining} left"
                 # Some terminals say that they have no columns and no rows; 80 by 24 are taken then.
                 wide, high = shutil.get_terminal_size()
-                self.bar = tqdm(total=1.0, bar_format=form, leave=False, file=sys.stderr, ncols=wide - 1, nrows=high)
+                self.bar = tqdm(
+                    desc="starting",
+                    total=1.0,
+                    bar_format=form,
+                    leave=False,
+                    file=sys.stderr,
+                    ncols=wide - 1,
+                    nrows=high,
+                )
+                threading.Thread(target=self._tick, daemon=True).start()
         return self
 
     def __call__(self, stage: str, share: float) -> None:
@@ -46,8 +58,14 @@ class Progress:
         self.stage = stage
 
     def __exit__(self, *_: object) -> None:
+        self.ended.set()
         if self.bar is not None:
             self.bar.close()
+
+    def _tick(self) -> None:
+        """Keeps the clock going through a long stage."""
+        while not self.ended.wait(1.0):
+            self.bar.refresh()
 
 
 @contextlib.contextmanager

@@ -434,6 +434,8 @@ def test_a_terminal_gets_a_bar(monkeypatch):
         progress("shapes", 0.4)
         assert progress.bar.n == 0.5, "a share never goes back"
         shown = sys.stderr.getvalue()
+        time.sleep(1.5)
+        assert len(sys.stderr.getvalue()) > len(shown), "the clock must go on through a long stage"
     assert "shapes" in shown
     assert "50 %" in shown
     assert "left" in shown
