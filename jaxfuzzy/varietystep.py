@@ -143,16 +143,17 @@ Moments = tuple[Array, Array, Array | None]
 def moments(share: Float[Array, "C N"], task: Task) -> Moments:
     """Centers (eq. 15), scatter (eq. 16) and, with the geometric distance, the mean of gradient products.
 
-    Padded coordinates get the largest eigenvalue, so that none is ever a normal.
+    Padded coordinates get an eigenvalue well above the smallest, so that none is ever a normal.
     """
     centers, scatter = weighted_moments(task.features, share)
-    pad = jnp.where(task.real, 0, 1).astype(scatter.dtype)
-    largest = lax.stop_gradient(1 + jnp.trace(scatter, axis1=1, axis2=2))[:, None, None]
+    pad = jnp.diag(jnp.where(task.real, 0, 1).astype(scatter.dtype))
+    total = lax.stop_gradient(jnp.trace(scatter, axis1=1, axis2=2))
     if task.gradients is None:
-        return centers, scatter + largest * jnp.diag(pad), None
+        return centers, scatter + (1 + total)[:, None, None] * pad, None
     metric = jnp.einsum("cn,nqd,npd->cqp", shares_of_one(share), task.gradients, task.gradients)
-    largest = largest / jnp.finfo(scatter.dtype).eps
-    return centers, scatter + largest * jnp.diag(pad), metric + jnp.diag(pad)
+    # The smallest eigenvalue is no larger than the quotient of the traces.
+    most = divide(total, lax.stop_gradient(jnp.trace(metric, axis1=1, axis2=2)))
+    return centers, scatter + (1 + 2 * LEAST_GAP * most)[:, None, None] * pad, metric + pad
 
 
 def shares_of_one(weights: Float[Array, "C N"]) -> Float[Array, "C N"]:
@@ -199,7 +200,7 @@ def status(
     eps = jnp.finfo(points.dtype).eps
     if metric is None:
         values = jnp.linalg.eigvalsh(scatter)
-        largest = jnp.where(jnp.arange(values.shape[1]) < task.real.sum(), values, 0).max(axis=1)
+        largest = jnp.trace(scatter * task.real, axis1=1, axis2=2)
         undetermined = values[:, task.across] - values[:, task.across - 1] <= 1e3 * eps * largest
     else:
         values = jax.vmap(lambda a, b: pencil(a, b)[0])(scatter, metric)

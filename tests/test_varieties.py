@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from jaxfuzzy.status import Status
 from jaxfuzzy.varieties import nfcv
 
 EPS = np.finfo(float).eps
-PLAIN = Solver(max_steps=4, tol=0.0, acceleration=None)
+ONCE = Solver(max_steps=1, tol=0.0, acceleration=None)
 TIGHT = Solver(max_steps=2000, tol=1e-14)
 
 
@@ -22,192 +24,194 @@ def arc(center, seed, count=120, outliers=20, noise=0.02):
     return np.vstack([surface, rng.uniform(-1, 1, (outliers, 3))]) + center
 
 
-POINTS = np.vstack([arc([3.0, 0, 8], 0), arc([5.0, 0.5, 7], 1)])
+POINTS = np.vstack([arc([-1.0, -0.2, 0.8], 0), arc([1.0, 0.3, -0.2], 1)])
 OWN = np.repeat(np.eye(2), 140, axis=0)
 START = 0.7 * OWN + 0.3 * np.random.default_rng(1).dirichlet([1, 1], 280)
 WEIGHTS = np.random.default_rng(2).uniform(0.2, 2, len(POINTS))
+PAIR = ("4d", "6d")
 ONE, ALL = POINTS[:140], np.ones((140, 1))
 
 
-@pytest.mark.parametrize(
-    ("name", "dimension", "noise", "m"),
-    [("6d", None, 3.0, 2.0), ("6d", 2, 3.0, 1.6), ("4d", None, None, 2.0), ("3d", 1, 0.3, 3.0), ("9d", None, 2.0, 2.0)],
-)
-def test_algebraic_is_the_paper_to_the_letter(name, dimension, noise, m):
-    fit = nfcv(
-        *(POINTS, START),
-        embedding=name,
-        dimension=dimension,
-        noise_distance=noise,
-        m=m,
-        distance="algebraic",
-        weights=WEIGHTS,
-        solver=PLAIN,
-    )
-    x, u = np.asarray(emb.features(POINTS, name)), START.T
-    q = dimension or x.shape[1] - 1
-    for _ in range(PLAIN.max_steps + 1):
-        centers, bases, squared = oracle.algebraic_step(x, u, q, m, WEIGHTS)
-        u, rest = oracle.memberships(squared, m, noise)
-    # raw coordinates near 8 make squares near 64, and distances lose digits as differences of those
-    np.testing.assert_allclose(fit.memberships, u.T, atol=1e-9)
-    np.testing.assert_allclose(fit.noise, rest, atol=1e-9)
-    np.testing.assert_allclose(fit.centers, centers, rtol=1e-10)
-    np.testing.assert_allclose(fit.squared_distances, squared.T, rtol=1e-7, atol=1e-11)
-    assert float(fit.objective) == pytest.approx(oracle.objective(squared, u, rest, m, noise, WEIGHTS), rel=1e-9)
-    for i in range(2):
-        np.testing.assert_allclose(fit.basis[i] @ fit.basis[i].T, bases[i] @ bases[i].T, atol=1e-9)
-        np.testing.assert_allclose(fit.basis[i].T @ fit.basis[i], np.eye(q), atol=1e-13)
-    if dimension is None:
-        np.testing.assert_allclose(np.einsum("cq,cqp->cp", fit.normals, fit.basis), 0, atol=1e-12)
-    else:
-        np.testing.assert_array_equal(fit.normals, 0)
+@pytest.mark.parametrize(("names", "dimension"), [(("4d", "6d"), None), (("3d", "6d"), 2)])
+def test_algebraic_is_the_paper_to_the_letter(names, dimension):
+    points = POINTS + [4, 0, 7]  # raw camera coordinates: the paper centers nothing
+    options = {"noise_distance": 3.0, "m": 1.7, "distance": "algebraic", "weights": WEIGHTS, "solver": ONCE}
+    together = nfcv(points, START, embedding=names, dimension=dimension, **options)
+    for e, name in enumerate(names):
+        x, u = np.asarray(emb.features(points, name)), START.T
+        size = x.shape[1]
+        q = dimension or size - 1
+        for _ in range(2):
+            centers, bases, squared = oracle.algebraic_step(x, u, q, 1.7, WEIGHTS)
+            u, rest = oracle.memberships(squared, 1.7, 3.0)
+        fit = jax.tree.map(lambda leaf, e=e: leaf[e], replace(together, m=WEIGHTS, noise_distance=WEIGHTS))
+        # eq. 13 is a difference of squares near 100 here, so it leaves distances down to 1e-7 only seven digits
+        np.testing.assert_allclose(fit.memberships, u.T, atol=1e-6)
+        np.testing.assert_allclose(fit.noise, rest, atol=1e-6)
+        np.testing.assert_allclose(fit.centers[:, :size], centers, rtol=1e-7)
+        np.testing.assert_allclose(fit.squared_distances, squared.T, rtol=1e-6, atol=1e-10)
+        expected = oracle.objective(squared, u, rest, 1.7, 3.0, WEIGHTS)
+        assert float(fit.objective) == pytest.approx(expected, rel=1e-9)
+        for i in range(2):
+            basis = fit.basis[i, :size, :q]
+            np.testing.assert_allclose(basis @ basis.T, bases[i] @ bases[i].T, atol=1e-7)
+            np.testing.assert_allclose(basis.T @ basis, np.eye(q), atol=1e-13)
+            if q == size - 1:
+                np.testing.assert_allclose(fit.normals[i, :size] @ basis, 0, atol=1e-12)
+            else:
+                np.testing.assert_array_equal(fit.normals[i], 0)
 
 
-@pytest.mark.parametrize("name", ["3d", "4d", "6d", "cylinder", "cone"])
-def test_geometric_is_taubins_step(name):
-    points = POINTS - [4, 0.2, 7.2]  # the oracle does not center
-    fit = nfcv(points, START, embedding=name, noise_distance=0.3, m=1.8, weights=WEIGHTS, solver=PLAIN)
-    x, gradients, u = np.asarray(emb.features(points, name)), np.asarray(emb.gradients(points, name)), START.T
-    for _ in range(PLAIN.max_steps + 1):
-        centers, normals, squared = oracle.geometric_step(x, gradients, u, 1.8, WEIGHTS)
-        u, rest = oracle.memberships(squared, 1.8, 0.3)
-    # rounding grows by the gaps of four eigenproblems, about 1e3
-    np.testing.assert_allclose(fit.memberships, u.T, atol=1e-9)
-    np.testing.assert_allclose(fit.noise, rest, atol=1e-9)
-    np.testing.assert_allclose(fit.squared_distances, squared.T, rtol=1e-6, atol=1e-10)
-    np.testing.assert_allclose(np.abs(np.sum(fit.normals * normals, 1)), 1, atol=1e-12)
-    np.testing.assert_allclose(np.sum(fit.normals * (fit.centers - centers), 1), 0, atol=1e-10)
+def test_geometric_is_taubins_step():
+    options = {"noise_distance": 0.3, "m": 1.8, "weights": WEIGHTS, "solver": ONCE}
+    together = nfcv(POINTS, START, embedding=PAIR, **options)
+    for e, name in enumerate(PAIR):
+        x, gradients = np.asarray(emb.features(POINTS, name)), np.asarray(emb.gradients(POINTS, name))
+        u, size = START.T, x.shape[1]
+        for _ in range(2):
+            centers, normals, squared = oracle.geometric_step(x, gradients, u, 1.8, WEIGHTS)
+            u, rest = oracle.memberships(squared, 1.8, 0.3)
+        np.testing.assert_allclose(together.memberships[e], u.T, atol=1e-10)
+        np.testing.assert_allclose(together.noise[e], rest, atol=1e-10)
+        np.testing.assert_allclose(together.squared_distances[e], squared.T, rtol=1e-8, atol=1e-11)
+        cosines = np.sum(together.normals[e, :, :size] * normals, 1)
+        np.testing.assert_allclose(np.abs(cosines), 1, atol=1e-12)
+        np.testing.assert_allclose(together.centers[e, :, :size], centers, atol=1e-11)
 
 
-def test_four_points_by_hand():
-    """Points (0, 0), (2, 0), (4, 0), (2, 3) weigh 1, 1, 1, 0 for one line: it is y = 0; u of the last is 1 / (1 + 9 / 4)."""
-    points = np.array([[0.0, 0], [2, 0], [4, 0], [2, 3]])
-    start = np.array([[1.0], [1], [1], [0]])
-    solver = Solver(max_steps=1, tol=0.0, acceleration=None)
-    fit = nfcv(points, start, embedding="linear", noise_distance=2.0, weights=[1, 1, 1, 0], solver=solver)
-    np.testing.assert_allclose(fit.squared_distances[:, 0], [0, 0, 0, 9], atol=1e-15)
-    np.testing.assert_allclose(fit.memberships[:, 0], [1, 1, 1, 4 / 13], atol=1e-15)
-    np.testing.assert_allclose(fit.noise, [0, 0, 0, 9 / 13], atol=1e-15)
+def test_five_points_by_hand():
+    """Three points on y = 0, two 3 off it: with delta = 2 those belong by 1 / (1 + 9 / 4) = 4 / 13, which keeps the line.
+
+    Scatter along is 2² + 2² = 8, across 2 (4 / 13)² 3² = 1.7; F = 2 · 9 · 4 / (9 + 4) = 72 / 13.
+    """
+    points = np.array([[0.0, 0], [2, 0], [4, 0], [2, 3], [2, -3]])
+    share = 4 / 13
+    start = np.array([[1.0], [1], [1], [share], [share]])
+    fit = nfcv(points, start, embedding="linear", noise_distance=2.0, solver=ONCE)
+    np.testing.assert_allclose(fit.squared_distances[:, 0], [0, 0, 0, 9, 9], atol=1e-15)
+    np.testing.assert_allclose(fit.memberships[:, 0], start[:, 0], atol=1e-15)
+    np.testing.assert_allclose(fit.noise, [0, 0, 0, 1 - share, 1 - share], atol=1e-15)
     np.testing.assert_allclose(fit.centers, [[2, 0]], atol=1e-15)
     np.testing.assert_allclose(fit.normals, [[0, 1]], atol=1e-15)
     np.testing.assert_allclose(np.abs(fit.basis[0, :, 0]), [1, 0], atol=1e-15)
-    np.testing.assert_array_equal(fit.labels, [0, 0, 0, -1])
-    np.testing.assert_array_equal(fit.inliers, [True, True, True, False])
+    np.testing.assert_allclose(fit.scatter[0], np.diag([8, 2 * 9 * share**2]) / (3 + 2 * share**2), atol=1e-14)
+    np.testing.assert_allclose(fit.objective, 72 / 13)
+    np.testing.assert_array_equal(fit.labels, [0, 0, 0, -1, -1])
+    np.testing.assert_array_equal(fit.inliers, [True, True, True, False, False])
 
 
-@pytest.mark.parametrize(("name", "noise"), [("6d", 3.0), ("6d", None), ("3d", 0.3)])
-def test_algebraic_objective_never_rises(name, noise):
-    options = {"embedding": name, "noise_distance": noise, "distance": "algebraic", "weights": WEIGHTS}
-    solver = Solver(max_steps=1, tol=0.0, acceleration=None)
-    fit, values = nfcv(POINTS, START, solver=solver, **options), []
+def test_algebraic_objective_never_rises():
+    options = {"embedding": PAIR, "noise_distance": 0.3, "distance": "algebraic", "weights": WEIGHTS, "solver": ONCE}
+    fit, values = nfcv(POINTS, START, **options), []
     for _ in range(25):
-        fit = nfcv(POINTS, fit, solver=solver, **options)
-        values.append(float(fit.objective))
-    # rounding of distances that are differences of squares near 64
-    assert (np.diff(values) <= 1e-10 * values[0]).all()
-    assert values[-1] < 0.99 * values[0]
+        fit = nfcv(POINTS, fit, **options)
+        values.append(np.asarray(fit.objective))
+    # rounding of the sums
+    assert (np.diff(values, axis=0) <= 1e-13 * values[0]).all()
+    assert (values[-1] < 0.99 * values[0]).all()
 
 
 @pytest.mark.parametrize("distance", ["algebraic", "geometric"])
 def test_answer_is_a_fixed_point(distance):
-    options = {"embedding": "cylinder", "noise_distance": 0.3, "distance": distance}
-    fit = nfcv(ONE, ALL, solver=Solver(tol=1e-12), **options)
+    options = {"embedding": "cylinder", "noise_distance": 0.3, "distance": distance, "solver": TIGHT}
+    fit = nfcv(ONE, ALL, **options)
     assert not int(fit.status) & Status.NOT_CONVERGED
-    again = nfcv(ONE, fit, solver=Solver(max_steps=1, tol=0.0), **options)
-    np.testing.assert_allclose(again.memberships, fit.memberships, atol=1e-10)
-    assert int(nfcv(ONE, ALL, solver=Solver(max_steps=2), **options).status) & Status.NOT_CONVERGED
-
-
-NAMES = ("3d", "cylinder", "6d", "cone")
+    again = nfcv(ONE, fit, **options)
+    assert int(again.steps) <= 2
+    np.testing.assert_allclose(again.memberships, fit.memberships, atol=1e-12)
 
 
 @pytest.mark.parametrize("distance", ["algebraic", "geometric"])
 def test_embeddings_side_by_side_are_as_one_by_one_and_padding_is_none(distance):
-    options = {"noise_distance": 0.3, "distance": distance, "weights": WEIGHTS, "solver": PLAIN}
-    points = POINTS - [4, 0.2, 7.2]
-    together = nfcv(points, START, embedding=NAMES, **options)
-    assert together.centers.shape == (4, 2, 6)
-    assert together.embedding == NAMES
-    for i, name in enumerate(NAMES):
-        alone = nfcv(points, START, embedding=name, **options)
+    options = {"noise_distance": 0.3, "distance": distance, "weights": WEIGHTS, "solver": ONCE}
+    together = nfcv(POINTS, START, embedding=PAIR, **options)
+    assert together.centers.shape == (2, 2, 6)
+    assert together.embedding == PAIR
+    for i, name in enumerate(PAIR):
+        alone = nfcv(POINTS, START, embedding=name, **options)
+        assert int(alone.status) & Status.NOT_CONVERGED
         q = alone.centers.shape[1]
-        for field in ("squared_distances", "memberships", "noise", "objective"):
-            # 8 eps, times what six eigenproblems with gaps near 1e-2 make of it
-            np.testing.assert_allclose(getattr(together, field)[i], getattr(alone, field), rtol=0, atol=5e3 * EPS)
+        for field in ("squared_distances", "memberships", "noise", "objective", "bounds"):
+            # 8 eps grow 1e4-fold: two varieties in 6D, each fitted twice with eigenvalue gaps near 1e-2
+            np.testing.assert_allclose(getattr(together, field)[i], getattr(alone, field), rtol=1e-10, atol=1e-10)
         for field in ("centers", "normals"):
-            np.testing.assert_allclose(getattr(together, field)[i][:, :q], getattr(alone, field), atol=5e3 * EPS)
+            np.testing.assert_allclose(getattr(together, field)[i][:, :q], getattr(alone, field), atol=1e-10)
             np.testing.assert_array_equal(getattr(together, field)[i][:, q:], 0)
         np.testing.assert_array_equal(together.basis[i][:, q:], 0)
         np.testing.assert_array_equal(together.labels[i], alone.labels)
 
 
-def test_hostile_padding_is_no_padding():
+@pytest.mark.parametrize("distance", ["algebraic", "geometric"])
+def test_hostile_padding_is_no_padding(distance):
     rng = np.random.default_rng(5)
-    where = np.sort(rng.choice(300, 280, replace=False))
-    padded, start, weights = 1e6 * rng.normal(size=(300, 3)), np.ones((300, 2)), np.zeros(300)
-    padded[where], start[where], weights[where] = POINTS, START, WEIGHTS
-    for distance in ("algebraic", "geometric"):
-        options = {"embedding": "cylinder", "noise_distance": 0.3, "distance": distance, "solver": PLAIN}
-        alone = nfcv(POINTS, START, weights=WEIGHTS, **options)
-        fit = nfcv(padded, start, weights=weights, **options)
-        np.testing.assert_allclose(fit.memberships[where], alone.memberships, atol=5e3 * EPS)
-        np.testing.assert_allclose(fit.centers, alone.centers, rtol=1e-12)
-        np.testing.assert_allclose(fit.bounds, alone.bounds, atol=1e-9)
-        assert int(fit.status) == int(alone.status)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((fit.scatter, fit.slopes, fit.objective)))
+    where = np.sort(rng.choice(160, 140, replace=False))
+    padded, start, weights = 1e6 * rng.normal(size=(160, 3)), rng.uniform(size=(160, 1)), np.zeros(160)
+    padded[where], start[where], weights[where] = ONE, ALL, 1
+    options = {"embedding": "cylinder", "noise_distance": 0.3, "distance": distance, "solver": TIGHT}
+    alone, fit = nfcv(ONE, ALL, **options), nfcv(padded, start, weights=weights, **options)
+    np.testing.assert_allclose(fit.memberships[where], alone.memberships, atol=800 * EPS)
+    np.testing.assert_allclose(fit.centers, alone.centers, atol=800 * EPS)
+    np.testing.assert_allclose(fit.bounds, alone.bounds, atol=800 * EPS)
+    assert int(fit.status) == int(alone.status) == 0
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((fit.scatter, fit.slopes, fit.objective)))
 
 
 def test_weights_count_points():
-    counts = np.random.default_rng(6).integers(0, 4, len(POINTS))
-    options = {"embedding": "cylinder", "noise_distance": 0.3, "solver": PLAIN}
-    weighted = nfcv(POINTS, START, weights=counts, **options)
-    repeated = nfcv(np.repeat(POINTS, counts, 0), np.repeat(START, counts, 0), **options)
-    np.testing.assert_allclose(np.repeat(weighted.memberships, counts, 0), repeated.memberships, atol=5e3 * EPS)
-    np.testing.assert_allclose(weighted.objective, repeated.objective, rtol=1e-11)
+    counts = np.random.default_rng(6).permutation(np.repeat([0, 1, 2, 1], 35))
+    options = {"embedding": "cylinder", "noise_distance": 0.3, "solver": TIGHT}
+    weighted, repeated = nfcv(ONE, ALL, weights=counts, **options), nfcv(np.repeat(ONE, counts, 0), ALL, **options)
+    np.testing.assert_allclose(np.repeat(weighted.memberships, counts, 0), repeated.memberships, atol=800 * EPS)
+    np.testing.assert_allclose(weighted.objective, repeated.objective, rtol=800 * EPS)
 
 
-def test_compiled_is_eager_and_one_compilation_serves_every_noise_distance():
+def test_compiled_is_eager_and_one_compilation_serves_all_values():
     def fit(points, start, noise_distance, m):
-        return nfcv(points, start, embedding="6d", noise_distance=noise_distance, m=m, solver=PLAIN)
+        return nfcv(points, start, embedding="cylinder", noise_distance=noise_distance, m=m, solver=TIGHT)
 
     compiled = jax.jit(fit)
     for noise, m in ((0.3, 2.0), (0.5, 1.7)):
-        for a, b in zip(*(jax.tree.leaves(f(POINTS, START, noise, m)) for f in (compiled, fit)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=8 * EPS, atol=8 * EPS)
+        for a, b in zip(*(jax.tree.leaves(f(ONE, ALL, noise, m)) for f in (compiled, fit)), strict=True):
+            if a.dtype == float:
+                np.testing.assert_allclose(a, b, rtol=0, atol=800 * EPS)
     assert compiled._cache_size() == 1
 
 
-def test_far_noise_is_no_noise_and_near_noise_takes_all():
-    options = {"embedding": "cylinder", "solver": Solver(tol=1e-13)}
-    plain, far = nfcv(POINTS, START, **options), nfcv(POINTS, START, noise_distance=1e7, **options)
+def test_far_noise_is_no_noise():
+    options = {"embedding": "cylinder", "solver": TIGHT}
+    plain, far = nfcv(ONE, ALL, **options), nfcv(ONE, ALL, noise_distance=1e7, **options)
     assert float(far.noise.max()) < 1e-13
-    np.testing.assert_allclose(far.memberships, plain.memberships, atol=1e-9)
+    np.testing.assert_array_equal(plain.memberships, 1)
+    np.testing.assert_allclose(far.normals, plain.normals, atol=1e-11)
+    np.testing.assert_allclose(far.objective, plain.objective, rtol=1e-11)
     np.testing.assert_array_equal(plain.noise, 0)
     assert np.isinf(plain.noise_distance)
     assert (plain.labels >= 0).all()
     assert plain.inliers.all()
-    for distance in ("geometric", "algebraic"):
-        none = nfcv(POINTS, START, noise_distance=1e-9, distance=distance, **options)
-        assert float(none.noise.min()) > 0.99
-        assert (none.labels == -1).all()
-        assert int(none.status) & Status.ALL_NOISE
+
+
+@pytest.mark.parametrize("distance", ["algebraic", "geometric"])
+def test_near_noise_takes_all(distance):
+    """All but the few points that any surface passes through; the status says that these prove nothing."""
+    options = {"embedding": "cylinder", "distance": distance, "solver": TIGHT}
+    for noise_distance in (1e-5, 1e-9):
+        none = nfcv(ONE, ALL, noise_distance=noise_distance, **options)
+        assert (np.asarray(none.noise) > 0.99).sum() >= 140 - 3
+        assert int(none.status) & (Status.ALL_NOISE | Status.TOO_FEW_POINTS)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(none))
 
 
 def test_noise_distance_may_differ_from_point_to_point():
     each = np.where(np.arange(140) < 100, 0.3, 0.1)
-    fit = nfcv(ONE, ALL, embedding="cylinder", noise_distance=each, solver=PLAIN)
+    fit = nfcv(ONE, ALL, embedding="cylinder", noise_distance=each, solver=TIGHT)
     expected = 1 / (1 + np.asarray(fit.squared_distances[:, 0]) / each**2)
     np.testing.assert_allclose(fit.memberships[:, 0], expected, rtol=1e-10)
 
 
 CASES = {
-    "algebraic, padded": (POINTS, START, {"embedding": ("3d", "6d"), "distance": "algebraic"}, 2.0),
-    "algebraic, q = 2 of 6": (POINTS, START, {"embedding": "6d", "dimension": 2, "distance": "algebraic"}, 2.0),
-    "geometric, padded": (ONE, ALL, {"embedding": ("sphere", "cylinder", "cone")}, 0.3),
-    "geometric, two planes": (POINTS, START, {"embedding": "3d"}, 0.3),
-    "no noise cluster": (POINTS, START, {"embedding": "3d"}, None),
+    "algebraic, padded": (POINTS, START, {"embedding": ("3d", "6d"), "distance": "algebraic"}, 0.3),
+    "algebraic, q = 2 of 6": (POINTS, START, {"embedding": "6d", "dimension": 2, "distance": "algebraic"}, 0.3),
+    "geometric, padded": (ONE, ALL, {"embedding": ("3d", "cylinder", "6d")}, 0.3),
+    "geometric, two planes, no noise cluster": (POINTS, START, {"embedding": "3d"}, None),
 }
 
 
@@ -226,32 +230,99 @@ CASES["repeated eigenvalues, q = 1"] = (*line_of_squares(), {"embedding": "3d", 
 def test_gradients_are_central_differences(name):
     points, start, options, noise = CASES[name]
     rng = np.random.default_rng(7)
-    mix = None
-
-    def value(arguments):
-        fit = nfcv(
-            arguments["points"],
-            start,
-            noise_distance=arguments.get("noise_distance"),
-            m=arguments["m"],
-            weights=arguments["weights"],
-            solver=TIGHT,
-            **options,
-        )
-        parts = (fit.memberships, fit.noise, fit.squared_distances, fit.objective, fit.centers, fit.normals)
-        nonlocal mix
-        if mix is None:
-            mix = [rng.normal(size=p.shape) for p in parts]
-        return sum(jnp.sum(a * b) for a, b in zip(mix, parts, strict=True))
-
     arguments = {"points": points, "m": np.array(2.2), "weights": np.ones(len(points))}
     if noise is not None:
         arguments["noise_distance"] = np.array(noise)
-    compiled, slope = jax.jit(value), jax.jit(jax.grad(value))(arguments)
+
+    def outcome(arguments):
+        fit = nfcv(start=start, solver=TIGHT, **options, **arguments)
+        parts = (fit.memberships, fit.noise, fit.squared_distances, fit.objective, fit.centers, fit.normals)
+        mix = np.random.default_rng(8)
+        return sum(jnp.sum(mix.normal(size=p.shape) * p) for p in parts)
+
+    both = jax.jit(jax.value_and_grad(outcome))
+    slope = both(arguments)[1]
     for key, at in arguments.items():
         direction = rng.normal(size=at.shape)
         step = 1e-5 / max(1.0, np.linalg.norm(direction) / 10)
-        up, down = (compiled({**arguments, key: at + sign * step * direction}) for sign in (1, -1))
-        numeric = (up - down) / (2 * step)
-        exact = np.sum(slope[key] * direction)
-        assert float(exact) == pytest.approx(float(numeric), rel=1e-6, abs=1e-6), key
+        up, down = (both({**arguments, key: at + sign * step * direction})[0] for sign in (1, -1))
+        # rounding of the fits, some 1e-12, over the step leaves the difference itself some 1e-7
+        expected = pytest.approx(float((up - down) / (2 * step)), rel=1e-6, abs=1e-6)
+        assert float(np.sum(slope[key] * direction)) == expected, key
+
+
+SINGLE = {"embedding": "cylinder", "noise_distance": 0.3, "solver": TIGHT}
+
+
+@pytest.mark.parametrize(
+    ("points", "weights", "bits"),
+    [
+        (np.ones((140, 3)), None, Status.DEGENERATE | Status.UNDER_DETERMINED),
+        (np.linspace(0, 1, 140)[:, None] * [1, 2, 3], None, Status.DEGENERATE),
+        (np.column_stack([np.arange(140) % 2, np.linspace(0, 1, 140), np.zeros(140)]), None, Status.UNDER_DETERMINED),
+        (ONE, np.arange(140) < 3, Status.TOO_FEW_POINTS),
+        (1e-3 * ONE, None, Status(0)),
+        (ONE + 100, None, Status(0)),
+    ],
+)
+@pytest.mark.parametrize("distance", ["geometric", "algebraic"])
+def test_hopeless_data_set_a_status_and_nothing_is_nan(points, weights, bits, distance):
+    noise = 0.3e-3 if np.ptp(points) < 0.01 else 0.3
+    fit = nfcv(points, ALL, distance=distance, weights=weights, **(SINGLE | {"noise_distance": noise}))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(fit))
+    if distance == "geometric" or bits:
+        assert int(fit.status) & bits == bits
+    if distance == "geometric" and not bits:
+        assert int(fit.status) == 0
+
+
+def test_twins_are_merged():
+    start = np.repeat(ALL, 2, 1)
+    assert int(nfcv(ONE, start, embedding="3d", solver=TIGHT).status) & Status.MERGED
+
+
+def test_hopeless_item_leaves_the_rest_of_a_batch_alone():
+    batch = np.stack([ONE, np.ones((140, 3)), np.full((140, 3), np.nan)])
+    fits = jax.jit(jax.vmap(lambda p: nfcv(p, ALL, **SINGLE)))(batch)
+    alone = nfcv(ONE, ALL, **SINGLE)
+    np.testing.assert_allclose(fits.memberships[0], alone.memberships, atol=800 * EPS)
+    assert int(fits.status[0]) == 0
+    assert int(fits.status[1]) & Status.DEGENERATE
+    assert int(fits.status[2]) & Status.NOT_FINITE
+
+
+def test_single_precision_stays_and_agrees():
+    small = nfcv(ONE.astype(np.float32), ALL.astype(np.float32), embedding="cylinder", noise_distance=0.3)
+    assert {leaf.dtype for leaf in jax.tree.leaves(small)} == {np.dtype(t) for t in ("f4", "i4", "i8", "bool")}
+    double = nfcv(ONE, ALL, **SINGLE)
+    # single precision stops at a change of 1e-6 of the spread; the gaps make 1e-4 of it
+    np.testing.assert_allclose(small.memberships, double.memberships, atol=1e-4)
+    assert int(small.status) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"embedding": "7d"}, ValueError, "embedding must be one of '3d'"),
+        ({"embedding": ()}, ValueError, "embedding must be a name or several, got none"),
+        ({"distance": "metric"}, ValueError, "distance must be one of 'geometric', 'algebraic', got 'metric'"),
+        ({"dimension": 3}, ValueError, r"dimension must be at least 1 and at most 2 \(Q - 1 of 'cylinder'\), got 3"),
+        ({"dimension": 1}, ValueError, "dimension must be Q - 1 with distance='geometric' in 'cylinder', got 1"),
+        ({"dimension": 1.0}, TypeError, "dimension must be a whole number, got 1.0"),
+        ({"m": 1.0}, ValueError, "m must be a finite number above 1.0, got 1.0"),
+        ({"noise_distance": 0}, ValueError, "noise_distance must be finite and above 0, got 0"),
+        ({"noise_distance": np.ones(3)}, ValueError, "noise_distance must have shape"),
+        ({"weights": -np.ones(140)}, ValueError, "weights must not be negative"),
+        ({"start": ALL[:5]}, ValueError, r"start must have shape \(140, C\), one row a point, got \(5, 1\)"),
+        ({"start": -ALL}, ValueError, "start must not be negative, got a smallest value of -1.0"),
+        ({"start": 0 * ALL}, ValueError, "start must leave no column all zero, got column 0 so"),
+        ({"points": ONE[:, :2]}, ValueError, "embedding must be 'linear' for points of 2 coordinates, got 'cylinder'"),
+        ({"points": np.where(ONE > 0.5, np.nan, ONE)}, ValueError, "points must be finite"),
+        ({"points": ONE + 1j}, TypeError, "points must be real numbers"),
+        ({"points": ONE[:, :1], "embedding": "linear"}, ValueError, "points must have at least two coordinates"),
+    ],
+)
+def test_wrong_arguments_are_named(change, error, message):
+    arguments = {"points": ONE, "start": ALL, **SINGLE} | change
+    with pytest.raises(error, match=message):
+        nfcv(**arguments)
