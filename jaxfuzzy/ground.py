@@ -187,7 +187,7 @@ def foreground(
         least = ABOVE * deviation_across(axis, ray, floor)
         kept &= height > least
         cut = jnp.asarray(np.median(least))
-    prior = prior_of(axis, (np.pi / 2, np.pi / 9, np.pi * 2 / 9), eye, cloud.dtype, starts=96, anywhere=True)
+    prior = prior_of(axis, (np.pi / 2, np.pi / 9, np.pi * 2 / 9), eye, cloud.dtype, anywhere=True)
     walls: list[Plane] = []
     standing = kept.copy()
     while len(walls) < MOST_WALLS and kept.any():

@@ -250,7 +250,7 @@ def prior_of(
     eye: np.ndarray | None,
     dtype: Any,
     *,
-    starts: int = 64,
+    starts: int = 96,
     anywhere: bool = False,
 ) -> Prior:
     """A prior with its starts spread evenly, on a Fibonacci spiral, over the directions that it allows.
