@@ -126,7 +126,9 @@ def fit_ground(
     w = np.ones(len(x), dtype) if mass is None else np.asarray(mass, dtype)
     axis = checks.direction(up, "up")
     checks.number(max_tilt, "max_tilt", above=0.0)
-    eye = None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), x.dtype)[0]
+    eye = (
+        None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), x.dtype)[0]
+    )
     std, known = _deviation(x, w, noise_distance, depth_std, eye)
     ray, floor = noise_of(x, std, eye if isinstance(noise_distance, str) else None)
     view = view_of(x, w, ray, floor, axis, eye)
@@ -176,7 +178,9 @@ def foreground(
     x = np.asarray(cloud)
     mass = checks.weights(weights, len(x))
     kept = np.ones(len(x), bool) if mass is None else np.asarray(mass) > 0
-    eye = None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), x.dtype)[0]
+    eye = (
+        None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), x.dtype)[0]
+    )
     std, known = _deviation(x, kept, "auto", ground.depth_std, eye)
     ray, floor = noise_of(x, std, eye)
     cut, table = jnp.zeros((), cloud.dtype), np.asarray(ground.inliers)
@@ -265,12 +269,14 @@ def _deviation(
         given = checks.noise_distance(depth_std, len(x), "depth_std")
         return np.broadcast_to(np.asarray(given, x.dtype), len(x)), True
     middle = np.median(x[w > 0], axis=0)
-    spread = np.median(np.linalg.norm(x[w > 0] - middle, axis=1))
+    # Points that are all equal have no spread; rounding is the least noise there is.
+    least = np.finfo(x.dtype).eps * max(float(np.abs(x).max()), np.finfo(x.dtype).tiny)
+    spread = max(float(np.median(np.linalg.norm(x[w > 0] - middle, axis=1))), least)
     if eye is None:
-        return np.full(len(x), max(spread, np.finfo(x.dtype).tiny), x.dtype), False
+        return np.full(len(x), spread, x.dtype), False
     # A stereo match is wrong by so many pixels: its depth by the square of the distance.
-    far = np.linalg.norm(x - eye, axis=1)
-    return spread * far**2 / np.median(far[w > 0] ** 2), False
+    square = ((x - eye) ** 2).sum(axis=1)
+    return np.maximum(spread * square / max(float(np.median(square[w > 0])), least), least).astype(x.dtype), False
 
 
 def _rectangle(inliers: np.ndarray, normal: np.ndarray, offset: float) -> Plane:

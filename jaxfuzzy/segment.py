@@ -17,12 +17,12 @@ from jaxfuzzy.validity import ClusterCount, choose_k
 
 # "auto" allows so many objects.
 MOST = 20
-# Bandwidth over the geometric mean of point spacing and size of the surface seen.
-BANDWIDTH = 0.9
+# Bandwidth over (spacing² · size)^(1/3), spacing that of the points on their surface, size that of the surface.
+BANDWIDTH = 2.3
 # Points beyond this number are gathered in cells of a third of the bandwidth; the sizes that are compiled.
 CAPACITIES = (512, 1024, 2048, 4096)
 # The spacing is measured at so many points, among so many, by the distance to this neighbour; a low quantile leaves outliers out.
-PROBES, CROWD, NEIGHBOUR, QUANTILE = 256, 8192, 8, 0.3
+PROBES, CROWD, NEIGHBOUR, QUANTILE, ALONE = 192, 4096, 8, 0.2, 2.5
 
 
 @record
@@ -153,7 +153,7 @@ def _paper(x: np.ndarray, w: np.ndarray, flat: np.ndarray, candidates: tuple[int
 
 
 def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
-    """The geometric mean of the spacing of the points on their surface and of the size of that surface, times a constant."""
+    """From the spacing of the points on their surface and the size of that surface; what lies alone counts as neither."""
     real = np.flatnonzero(w > 0)
     crowd = x[real[np.linspace(0, len(real) - 1, min(len(real), CROWD)).astype(int)]].astype(float)
     probes = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), PROBES)).astype(int)]
@@ -161,27 +161,27 @@ def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     offset = crowd.mean(axis=0)
     crowd, probes = crowd - offset, probes - offset
     square = (probes**2).sum(axis=1)[:, None] + (crowd**2).sum(axis=1) - 2 * probes @ crowd.T
-    reach = np.quantile(np.sqrt(np.maximum(np.partition(square, neighbour, axis=1)[:, neighbour], 0)), QUANTILE)
-    # `neighbour` points within a disc of this radius: each has this area of surface.
-    area = np.pi * reach**2 / max(neighbour, 1)
-    surface, spacing = np.sqrt(len(crowd) * area), np.sqrt(len(crowd) * area / len(real))
+    reach = np.sqrt(np.maximum(np.partition(square, neighbour, axis=1)[:, neighbour], 0))
+    usual = np.quantile(reach, QUANTILE)
+    # `neighbour` points within a disc of this radius: so much surface has each of the points that lie on a surface.
+    area = np.pi * usual**2 / max(neighbour, 1) * (reach <= ALONE * usual).mean() * len(crowd)
+    spacing, surface = np.sqrt(area / max(len(real) * (reach <= ALONE * usual).mean(), 1)), np.sqrt(area)
     smallest = np.sqrt(np.finfo(x.dtype).eps) * max(float(np.abs(crowd).max()), 1e-30)
-    return max(BANDWIDTH * float(np.sqrt(spacing * surface)), smallest)
+    return max(BANDWIDTH * float(np.cbrt(spacing**2 * surface)), smallest)
 
 
 def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The points as few enough weighted places, padded; and the place of each point."""
     most = CAPACITIES[-1]
-    real, cell = np.flatnonzero(w > 0), np.arange(len(flat))
-    if len(flat) > most:
-        pitch = bandwidth / 3
-        while True:
-            corner = np.floor(flat / pitch).astype(np.int64)
-            key = (corner[:, 0] - corner[:, 0].min()) * (np.ptp(corner[:, 1]) + 1) + corner[:, 1] - corner[:, 1].min()
-            cell = np.unique(key, return_inverse=True)[1]
-            if cell.max() < most:
-                break
-            pitch *= 1.25
+    real = np.flatnonzero(w > 0)
+    pitch = bandwidth / 3
+    while True:
+        corner = np.floor(flat / pitch).astype(np.int64)
+        key = (corner[:, 0] - corner[:, 0].min()) * (np.ptp(corner[:, 1]) + 1) + corner[:, 1] - corner[:, 1].min()
+        cell = np.unique(key, return_inverse=True)[1]
+        if cell.max() < most:
+            break
+        pitch *= 1.25
     number = int(cell.max()) + 1
     # A point counts as one on the average, and a cloud for no more points than there are places: neighbouring pixels err alike.
     scale = min(len(real), most) / w.sum()
