@@ -121,6 +121,16 @@ def direction(value: Any, name: str) -> np.ndarray:
     return array / length
 
 
+def position(value: Any, name: str) -> np.ndarray:
+    """A place (3,), finite."""
+    array = np.asarray(_numeric(value, name), float)
+    if array.shape != (3,):
+        raise ValueError(f"{name} must have shape (3,), got {tuple(array.shape)}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {_shown(array)}")
+    return array
+
+
 def labels(value: Any, count: int, name: str = "labels") -> np.ndarray:
     """Labels (N,): whole numbers, -1 for outliers."""
     array = np.asarray(value)

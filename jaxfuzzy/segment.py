@@ -94,7 +94,7 @@ def segment(
     axes = np.asarray(tangents(jnp.asarray(checks.direction(up, "up"))))
     noise = _noise(noise_distance, count)
     if camera is not None:
-        checks.points(np.reshape(camera, (1, -1)), "camera", dims=3)
+        checks.position(camera, "camera")
     x = np.asarray(cloud)
     w = np.ones(count, x.dtype) if given is None else np.asarray(given, x.dtype)
     if rule == "paper":

@@ -234,7 +234,7 @@ def test_outline_is_full_inside_and_empty_far_outside():
         ({"depth_std": np.ones(3)}, "depth_std must have shape"),
         ({"weights": np.ones(3)}, "weights must have shape"),
         ({"max_tilt": 0.0}, "max_tilt must be a finite number above"),
-        ({"camera": (0, 0)}, r"camera must have shape \(N, 3\)"),
+        ({"camera": (0, 0)}, r"camera must have shape \(3,\)"),
     ],
 )
 def test_wrong_arguments_are_named(change, message):
