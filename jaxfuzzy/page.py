@@ -117,6 +117,7 @@ def viewer(scene: "Scene", kept: slice) -> str:
         models[mesh.id] = index
         low, high = np.minimum(low, (vertices @ turn).min(0)), np.maximum(high, (vertices @ turn).max(0))
     focus, reach = (low + high) / 2, float(np.linalg.norm(high - low))
+    focus = focus - [0.0, 0.0, 0.08 * reach]  # what is near looks larger, so the middle of the picture lies lower
     views = {
         "front": [*(focus + reach * np.array([0.0, -0.7, 0.4])), *focus, 0, 0, 1],
         "above": [*(focus + reach * np.array([0.0, -0.01, 0.8])), *focus, 0, 0, 1],

@@ -40,6 +40,12 @@ function zoom(factor) {
   look([0, 1, 2].map(i => camera[i + 3] + factor * (camera[i] - camera[i + 3])).concat(camera.slice(3)));
 }
 
+// The views are made for a frame as wide as high; a narrow one is looked at from farther away.
+function view(name) {
+  camera = META[name].slice();
+  zoom(Math.max(1, (1.2 * world.height) / world.width));
+}
+
 K3DInstance.on(events.CAMERA_CHANGE, places => { camera = Array.from(places); });
 K3DInstance.on(events.OBJECT_CLICKED, hit => {
   const number = META.models[hit.K3DIdentifier];
@@ -50,10 +56,11 @@ addEventListener("message", event => {
   const message = event.data;
   if ("select" in message) select(message.select);
   if ("show" in message) show(message.show, message.on);
-  if ("view" in message) look(META[message.view]);
+  if ("view" in message) view(message.view);
   if ("turn" in message) turn(message.turn);
   if ("zoom" in message) zoom(message.zoom);
   if ("background" in message) { K3DInstance.setClearColor(message.background); K3DInstance.render(); }
 });
 K3DInstance.setViewMode("callback");
+view("front");
 parent.postMessage({ready: true}, "*");
