@@ -8,17 +8,19 @@ them belong together unless the support of the plane has a valley between them. 
 a count of points, so that a valley can be told from chance: the square root of a Poisson count has the same spread everywhere.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxfuzzy.arrays import Array, Bool, Float, Int, record
 
-# Small clusters that tile the objects, and how many neighbours each is compared with, at how many places on the way.
-PROTOTYPES, NEIGHBOURS, STOPS = 128, 8, 7
+# Small clusters that tile the objects (the sizes compiled); neighbours each is compared with, at so many places on the way.
+PROTOTYPES, NEIGHBOURS, STOPS = (32, 64, 128), 6, 5
 SWEEPS = 10
+# Bandwidths that the number of groups is looked for at: two ladders of a factor 2 in h², interleaved, over the first one's base.
+LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
+BASE = 2
 # Lengths in bandwidths: distance between seeds, noise distance, farthest neighbour, margin of the box that background is sought in.
 APART, DELTA, REACH, MARGIN = 2.0, 2.4, 7.2, 4.0
 # Support below which no seed is put, and the lattice on which the background is measured.
@@ -27,7 +29,7 @@ LEAST, LATTICE = 3.0, 16
 VALLEY, VALLEY_SIGMAS = 0.6, 4.0
 # ... and it stands so many above the background.
 PEAK_SIGMAS = 6.0
-# A point is an outlier when its support is below this share of its object's mean, and less than so many deviations above background.
+# An outlier's support is below this share of its object's mean, and not so many deviations above the background.
 SPARSE, SPARSE_SIGMAS = 0.2, 4.0
 BLOCK = 512
 
@@ -55,14 +57,11 @@ class Groups:
     objective: Float[Array, ""]
 
 
-@partial(jax.jit, static_argnames=("most",))
 def part(
     places: Float[Array, "P 2"],
     weights: Float[Array, " P"],
     bandwidth: Float[Array, ""],
     allowed: Bool[Array, " G"],
-    *,
-    most: int,
 ) -> Groups:
     """Parts the places of a plane into groups.
 
@@ -71,48 +70,129 @@ def part(
         weights: Number of points at each place.
         bandwidth: Bandwidth h of the support.
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
-        most: The largest number.
     """
-    support = partial(_support, places=places, weights=weights, bandwidth=bandwidth)
-    held = support(places)
+    tiling = _tile(places, weights, bandwidth)
+    number = int(tiling.real.sum())
+    kept = next(size for size in PROTOTYPES if size >= number)
+    tiling = Tiling(tiling.prototypes[:kept], tiling.real[:kept], tiling.held, tiling.objective)
+    return _divide(places, weights, bandwidth, tiling, allowed)
+
+
+@record
+class Tiling:
+    """Small clusters that tile the dense parts of a plane.
+
+    Attributes:
+        prototypes: Their centers, the strongest seed's first.
+        real: Which of them are.
+        held: Support of each place.
+        objective: Objective of the noise clustering.
+    """
+
+    prototypes: Float[Array, "C 2"]
+    real: Bool[Array, " C"]
+    held: Float[Array, " P"]
+    objective: Float[Array, ""]
+
+
+@jax.jit
+def _tile(places: Array, weights: Array, bandwidth: Array) -> Tiling:
+    """Noise clustering from mountain seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2)."""
+    held = _supports(places, places, weights, bandwidth[None])[0]
     seeds, real = _mountains(places, held, weights, bandwidth)
-    prototypes, objective = _tile(places, weights, seeds, real, DELTA * bandwidth)
-    one, other, saddle, near, peak, background = _saddles(prototypes, real, places, weights, bandwidth, support)
-    valley, prominence = _prominences(one, other, saddle, near, peak, real, background)
-    # Peaks by falling prominence; how many pass every test; the nearest number that is allowed.
-    found = jnp.maximum((prominence >= 1).sum(), 1)
+    delta = DELTA * bandwidth
+
+    def update(prototypes: Array, _: None) -> tuple[Array, Array]:
+        inverse = jnp.where(real, 1 / _squared_distances(places, prototypes, delta), 0)
+        total = inverse.sum(axis=1, keepdims=True) + delta**-2
+        pull = weights[:, None] * (inverse / total) ** 2
+        mass = pull.sum(axis=0)[:, None]
+        moved = (pull.T @ places) / jnp.maximum(mass, jnp.finfo(places.dtype).tiny)
+        return jnp.where(real[:, None] & (mass > 0), moved, prototypes), weights @ (1 / total[:, 0])
+
+    prototypes, objectives = lax.scan(update, seeds, length=SWEEPS)
+    return Tiling(prototypes, real, held, objectives[-1])
+
+
+@jax.jit
+def _divide(places: Array, weights: Array, bandwidth: Array, tiling: Tiling, allowed: Array) -> Groups:
+    prototypes, real, most = tiling.prototypes, tiling.real, len(allowed)
+    one, other, near = _neighbours(prototypes, real, bandwidth)
+    peaks, saddles, backgrounds = _landscape(prototypes, one, other, places, weights, bandwidth)
+    peaks = jnp.where(real, peaks, 0)
+    saddles = jnp.where(near, jnp.minimum(saddles, jnp.minimum(peaks[:, one], peaks[:, other])), -1)
+    orders = jnp.argsort(-saddles, axis=1, stable=True)
+    judge = jax.vmap(lambda *level: _prominences(one, other, near, real, *level))
+    valleys, prominences = judge(orders, saddles, peaks, backgrounds)
+    counts = jnp.maximum((prominences >= 1).sum(axis=1), 1)
+    level = _steadiest(counts)
+    peak, order, valley, prominence = peaks[level], orders[level], valleys[level], prominences[level]
+
+    # The nearest number that is allowed, the lower of two.
     numbers = jnp.arange(1, most + 1)
-    wanted = numbers[jnp.argmin(jnp.where(allowed, jnp.abs(numbers - found) + 0.1 * (numbers > found), jnp.inf))]
-    rank = jnp.argsort(jnp.argsort(-prominence, stable=True), stable=True)
-    kept = (rank < wanted) & (prominence > 0)
-    root = _join(one, other, near, peak, kept | (valley >= 1))
-    # Objects in the order of their prototypes' support, strongest first.
-    order = jnp.argsort(jnp.argsort(jnp.where(kept, -peak, jnp.inf), stable=True), stable=True)
-    group = jnp.where(kept[root] & real, order[root], -1)
+    wanted = numbers[jnp.argmin(jnp.where(allowed, jnp.abs(numbers - counts[level]), jnp.inf))]
+    kept = (_rank(-prominence) < wanted) & (prominence > 0)
+    root = _join(one[order], other[order], near[order], peak, kept | (valley >= 1))
+    # Objects in the order of their peaks, the strongest first.
+    group = jnp.where(kept[root] & real, _rank(jnp.where(kept, -peak, jnp.inf))[root], -1)
 
     inverse = jnp.where(real, 1 / _squared_distances(places, prototypes, bandwidth), 0)
     inverse = inverse / inverse.sum(axis=1, keepdims=True)
     shares = inverse @ (group[:, None] == jnp.arange(most)).astype(places.dtype)
     mine = weights[:, None] * shares**2
-    usual = (held @ mine) / jnp.maximum(mine.sum(axis=0), jnp.finfo(places.dtype).tiny)
-    chance = (jnp.sqrt(background) + SPARSE_SIGMAS / 2) ** 2
+    usual = (tiling.held @ mine) / jnp.maximum(mine.sum(axis=0), jnp.finfo(places.dtype).tiny)
+    chance = (jnp.sqrt(backgrounds[BASE]) + SPARSE_SIGMAS / 2) ** 2
     least = jnp.minimum(SPARSE * usual[jnp.argmax(shares, axis=1)], chance)
-    typicality = held / jnp.maximum(least, jnp.finfo(places.dtype).tiny)
-    return Groups(prototypes, group, found, kept.sum(), shares, typicality, objective)
+    typicality = tiling.held / jnp.maximum(least, jnp.finfo(places.dtype).tiny)
+    return Groups(prototypes, group, counts[level], kept.sum(), shares, typicality, tiling.objective)
 
 
-def _support(
-    queries: Float[Array, "M 2"], places: Float[Array, "P 2"], weights: Float[Array, " P"], bandwidth: Array
-) -> Float[Array, " M"]:
-    """Support of each query, summed over blocks of places."""
+def _rank(values: Array) -> Array:
+    return jnp.argsort(jnp.argsort(values, stable=True), stable=True)
+
+
+def _steadiest(counts: Int[Array, " L"]) -> Int[Array, ""]:
+    """Of a ladder of bandwidths, one at which the number of groups is the one that stays longest; near the base."""
+    rungs = jnp.arange(len(counts))
+    same = counts[:, None] == counts
+    # A run from i to j is whole when no rung between differs.
+    between = (rungs >= jnp.minimum(rungs[:, None], rungs)[..., None]) & (
+        rungs <= jnp.maximum(rungs[:, None], rungs)[..., None]
+    )
+    run = jnp.all(same[:, None, :] | ~between, axis=-1)
+    length = run.sum(axis=1)
+    # Of two that stay as long the narrower; within a run the rung nearest to the base.
+    first = jnp.argmax(run, axis=1)
+    return jnp.argmin(-length * 10000 + first * 100 + jnp.abs(rungs - BASE))
+
+
+def _supports(
+    queries: Float[Array, "M 2"],
+    places: Float[Array, "P 2"],
+    weights: Float[Array, " P"],
+    bandwidths: Float[Array, " L"],
+) -> Float[Array, "L M"]:
+    """Support of each query at each bandwidth, summed over blocks of places.
+
+    The bandwidths are one ladder of a factor 2 in h² downwards from each of the last two, which takes two exponentials for all.
+    """
+    levels = len(bandwidths)
 
     def add(total: Array, block: tuple[Array, Array]) -> tuple[Array, None]:
         place, weight = block
         square = (queries**2).sum(axis=1)[:, None] + (place**2).sum(axis=1) - 2 * queries @ place.T
-        return total + jnp.exp(-0.5 * jnp.maximum(square, 0) / bandwidth**2) @ weight, None
+        square = -0.5 * jnp.maximum(square, 0)
+        rows: dict[int, Array] = {}
+        kernels: dict[int, Array] = {}
+        for level in reversed(range(levels)):
+            above = kernels.get(level + 2)
+            kernels[level] = jnp.exp(square / bandwidths[level] ** 2) if above is None else above**2
+            rows[level] = kernels[level] @ weight
+        return total + jnp.stack([rows[level] for level in range(levels)]), None
 
-    blocks = places.reshape(-1, min(BLOCK, len(places)), 2), weights.reshape(-1, min(BLOCK, len(places)))
-    return lax.scan(add, jnp.zeros(len(queries), places.dtype), blocks)[0]
+    block = min(BLOCK, len(places))
+    blocks = places.reshape(-1, block, 2), weights.reshape(-1, block)
+    return lax.scan(add, jnp.zeros((levels, len(queries)), places.dtype), blocks)[0]
 
 
 def _mountains(places: Array, held: Array, weights: Array, bandwidth: Array) -> tuple[Array, Array]:
@@ -125,24 +205,13 @@ def _mountains(places: Array, held: Array, weights: Array, bandwidth: Array) -> 
         near = ((places - places[best]) ** 2).sum(axis=1) < (APART * bandwidth) ** 2
         return jnp.where(near, -1.0, left), seeds.at[index].set(places[best]), real.at[index].set(good)
 
-    start = jnp.where(weights > 0, held, -1), jnp.zeros((PROTOTYPES, 2), places.dtype), jnp.zeros(PROTOTYPES, bool)
-    _, seeds, real = lax.fori_loop(0, PROTOTYPES, pick, start)
+    start = (
+        jnp.where(weights > 0, held, -1),
+        jnp.zeros((PROTOTYPES[-1], 2), places.dtype),
+        jnp.zeros(PROTOTYPES[-1], bool),
+    )
+    _, seeds, real = lax.fori_loop(0, PROTOTYPES[-1], pick, start)
     return seeds, real
-
-
-def _tile(places: Array, weights: Array, seeds: Array, real: Array, delta: Array) -> tuple[Array, Array]:
-    """Noise clustering from the seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2)."""
-
-    def update(prototypes: Array, _: None) -> tuple[Array, Array]:
-        inverse = jnp.where(real, 1 / _squared_distances(places, prototypes, delta), 0)
-        total = inverse.sum(axis=1, keepdims=True) + delta**-2
-        pull = weights[:, None] * (inverse / total) ** 2
-        mass = pull.sum(axis=0)[:, None]
-        moved = (pull.T @ places) / jnp.maximum(mass, jnp.finfo(places.dtype).tiny)
-        return jnp.where(real[:, None] & (mass > 0), moved, prototypes), weights @ (1 / total[:, 0])
-
-    prototypes, objectives = lax.scan(update, seeds, length=SWEEPS)
-    return prototypes, objectives[-1]
 
 
 def _squared_distances(places: Array, prototypes: Array, scale: Array) -> Array:
@@ -150,28 +219,29 @@ def _squared_distances(places: Array, prototypes: Array, scale: Array) -> Array:
     return jnp.maximum(square, 1e-6 * scale**2)
 
 
-def _saddles(
-    prototypes: Array, real: Array, places: Array, weights: Array, bandwidth: Array, support: partial[Array]
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Pairs of neighbours by falling saddle between them; support at each prototype; the background."""
+def _neighbours(prototypes: Array, real: Array, bandwidth: Array) -> tuple[Array, Array, Array]:
+    """Pairs of prototypes that stand near each other: the one, the other, and whether they are near at all."""
     gap = jnp.sqrt(((prototypes[:, None] - prototypes) ** 2).sum(axis=-1))
-    gap = jnp.where(jnp.eye(PROTOTYPES, dtype=bool) | ~(real[:, None] & real), jnp.inf, gap)
+    gap = jnp.where(jnp.eye(len(real), dtype=bool) | ~(real[:, None] & real), jnp.inf, gap)
     length, other = lax.top_k(-gap, NEIGHBOURS)
-    one, other = jnp.repeat(jnp.arange(PROTOTYPES), NEIGHBOURS), other.ravel()
-    near = -length.ravel() < REACH * bandwidth
+    one = jnp.repeat(jnp.arange(len(real)), NEIGHBOURS)
+    return one, other.ravel(), -length.ravel() < REACH * bandwidth
+
+
+def _landscape(
+    prototypes: Array, one: Array, other: Array, places: Array, weights: Array, bandwidth: Array
+) -> tuple[Array, Array, Array]:
+    """At each bandwidth of the ladder: support at the prototypes, the least on the way between neighbours, the background."""
     stops = ((jnp.arange(STOPS) + 1) / (STOPS + 1)).astype(places.dtype)[:, None]
     way = prototypes[one][:, None] * (1 - stops) + prototypes[other][:, None] * stops
     low, high = _box(places, weights)
     low, high = low - MARGIN * bandwidth, high + MARGIN * bandwidth
     step = (jnp.arange(LATTICE) + 0.5) / LATTICE
     lattice = low + (high - low) * jnp.stack(jnp.meshgrid(step, step), axis=-1).reshape(-1, 2).astype(places.dtype)
-    held = support(jnp.concatenate([prototypes, way.reshape(-1, 2), lattice]))
-    peak = jnp.where(real, held[:PROTOTYPES], 0)
-    on_way = held[PROTOTYPES : PROTOTYPES + way.shape[0] * STOPS].reshape(-1, STOPS).min(axis=1)
-    saddle = jnp.where(near, jnp.minimum(on_way, jnp.minimum(peak[one], peak[other])), -1)
-    order = jnp.argsort(-saddle, stable=True)
-    background = jnp.median(held[-(LATTICE**2) :])
-    return one[order], other[order], saddle[order], near[order], peak, background
+    queries = jnp.concatenate([prototypes, way.reshape(-1, 2), lattice])
+    held = _supports(queries, places, weights, bandwidth * jnp.asarray(LADDER, places.dtype))
+    peaks, on_way, around = jnp.split(held, [len(prototypes), len(queries) - len(lattice)], axis=1)
+    return peaks, on_way.reshape(len(LADDER), -1, STOPS).min(axis=-1), jnp.median(around, axis=1)
 
 
 def _box(places: Array, weights: Array) -> tuple[Array, Array]:
@@ -184,7 +254,7 @@ def _box(places: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _prominences(
-    one: Array, other: Array, saddle: Array, near: Array, peak: Array, real: Array, background: Array
+    one: Array, other: Array, near: Array, real: Array, order: Array, saddle: Array, peak: Array, background: Array
 ) -> tuple[Array, Array]:
     """How clearly each prototype is the peak of a group of its own; 1 is just clear enough.
 
@@ -192,34 +262,38 @@ def _prominences(
     chance and against its own height. The first value judges the valley alone, the second also the height above the background.
     """
 
-    def meet(edge: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def meet(step: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         root, ended = state
+        edge = order[step]
         a, b = root[one[edge]], root[other[edge]]
-        lower = jnp.where((peak[a] < peak[b]) | ((peak[a] == peak[b]) & (a > b)), a, b)
-        upper = a + b - lower
+        lower = _lower(peak, a, b)
         meets = near[edge] & (a != b)
-        root = jnp.where(meets & (root == lower), upper, root)
+        root = jnp.where(meets & (root == lower), a + b - lower, root)
         return root, ended.at[lower].set(jnp.where(meets, saddle[edge], ended[lower]))
 
     # What never meets another ends at no support at all.
-    _, ended = lax.fori_loop(0, len(one), meet, (jnp.arange(PROTOTYPES), jnp.zeros_like(peak)))
+    start = jnp.arange(len(real)), jnp.zeros_like(peak)
+    _, ended = lax.fori_loop(0, len(one), meet, start)
     share = 1 - ended / jnp.maximum(peak, jnp.finfo(peak.dtype).tiny)
     sigmas = 2 * (jnp.sqrt(peak) - jnp.sqrt(jnp.maximum(ended, 0)))
     valley = jnp.where(real, jnp.minimum(share / (1 - VALLEY), sigmas / VALLEY_SIGMAS), 0)
     above = 2 * (jnp.sqrt(peak) - jnp.sqrt(background)) / PEAK_SIGMAS
     # The strongest peak is an object whatever the background.
-    strongest = jnp.arange(PROTOTYPES) == jnp.argmax(peak)
+    strongest = jnp.arange(len(real)) == jnp.argmax(peak)
     return valley, jnp.where(strongest, jnp.inf, jnp.where(real, jnp.minimum(valley, above), 0))
 
 
 def _join(one: Array, other: Array, near: Array, peak: Array, stands: Array) -> Array:
-    """Joins neighbours by falling saddle, except where both groups have a peak that stands."""
+    """Joins neighbours, in the order given, except where both groups have a peak that stands."""
 
     def meet(edge: Array, root: Array) -> Array:
         a, b = root[one[edge]], root[other[edge]]
-        lower = jnp.where((peak[a] < peak[b]) | ((peak[a] == peak[b]) & (a > b)), a, b)
-        lower = jnp.where(stands[a] & ~stands[b], b, jnp.where(stands[b] & ~stands[a], a, lower))
+        lower = jnp.where(stands[a] == stands[b], _lower(peak, a, b), jnp.where(stands[a], b, a))
         joins = near[edge] & (a != b) & ~(stands[a] & stands[b])
         return jnp.where(joins & (root == lower), a + b - lower, root)
 
-    return lax.fori_loop(0, len(one), meet, jnp.arange(PROTOTYPES))
+    return lax.fori_loop(0, len(one), meet, jnp.arange(len(peak)))
+
+
+def _lower(peak: Array, a: Array, b: Array) -> Array:
+    return jnp.where((peak[a] < peak[b]) | ((peak[a] == peak[b]) & (a > b)), a, b)
