@@ -213,14 +213,12 @@ def _model(
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, weights=own_weights, **seen, **picked)
-    labels = np.full(count, -1, np.int32)
-    labels[own] = parts.labels
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,
         up=jnp.asarray(vertical, points.dtype),
         ground=plane,
-        segmentation=dataclasses.replace(parts, labels=jnp.asarray(labels)),
+        segmentation=_of_all(parts, own, count),
         shapes=shapes,
         timings=clock.seconds,
         settings={name: _plain(value) for name, value in (settings | options).items()},
@@ -238,6 +236,19 @@ def load_scene(folder: str | Path) -> Scene:
     from jaxfuzzy import report
 
     return report.load(folder)
+
+
+def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:
+    """A division of some points as one of all: the others belong to noise alone."""
+    partition = parts.partition
+    labels = jnp.full(count, -1, parts.labels.dtype).at[own].set(parts.labels)
+    whole = dataclasses.replace(
+        partition,
+        memberships=jnp.zeros((count, parts.k), partition.memberships.dtype).at[own].set(partition.memberships),
+        noise=jnp.ones(count, partition.noise.dtype).at[own].set(partition.noise),
+        labels=labels,
+    )
+    return dataclasses.replace(parts, labels=labels, partition=whole)
 
 
 def _told(noise_distance: Any) -> Any:

@@ -64,7 +64,7 @@ def histogram_seeds(points: ArrayLike, k: int, *, bins: int | None = None, weigh
     Args:
         points: Points (N, D).
         k: Number of seeds, at most N.
-        bins: Number of bins; None takes twice the cube root of N (Rice's rule), at least 8.
+        bins: Number of bins; None takes twice the cube root of the points' weight (Rice's rule), at least 8.
         weights: Weight of each point (N,).
 
     Raises:
@@ -79,7 +79,9 @@ def histogram_seeds(points: ArrayLike, k: int, *, bins: int | None = None, weigh
     along = (rows - mean) @ axes[0]
     present = heaviness > 0
     low, high = along[present].min(), along[present].max()
-    edges = np.linspace(low, high if high > low else low + 1, (bins or max(8, round(2 * len(rows) ** (1 / 3)))) + 1)
+    # Counting weight, not rows, makes weight 2 the same as the point twice.
+    bins = bins or max(8, round(2 * heaviness.sum() ** (1 / 3)))
+    edges = np.linspace(low, high if high > low else low + 1, bins + 1)
     place = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, len(edges) - 2)
     counts = np.bincount(place, heaviness, len(edges) - 1)
     owner, peaks = _agglomerates(counts)
@@ -91,11 +93,17 @@ def histogram_seeds(points: ArrayLike, k: int, *, bins: int | None = None, weigh
         group = groups.pop(heaviest)
         sort = group[np.argsort(along[group], kind="stable")]
         heap = np.cumsum(heaviness[sort])
-        cut = int(np.clip(np.searchsorted(heap, heap[-1] / 2) + 1, 1, max(len(sort) - 1, 1)))
+        cut = _between(along[sort], int(np.searchsorted(heap, heap[-1] / 2)) + 1)
         groups[heaviest:heaviest] = [sort[:cut], sort[cut:] if len(sort) > 1 else sort]
     centers = np.stack([heaviness[g] @ rows[g] / heaviness[g].sum() for g in groups[:k]])
     as_type = lambda value: jnp.asarray(value, array.dtype)
     return Seeds(as_type(centers), as_type(axes[0]), as_type(mean), as_type(edges), as_type(counts), jnp.asarray(peaks))
+
+
+def _between(values: np.ndarray, cut: int) -> int:
+    """The nearest cut of sorted values that keeps equal ones together, so that a weight does what repetition does."""
+    cuts = np.flatnonzero(np.diff(values) > 0) + 1
+    return int(cuts[np.abs(cuts - cut).argmin()]) if len(cuts) else max(1, len(values) // 2)
 
 
 def _eager(points: ArrayLike, weights: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:

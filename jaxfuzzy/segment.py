@@ -143,7 +143,8 @@ def _paper(x: np.ndarray, w: np.ndarray, flat: np.ndarray, candidates: tuple[int
     count = choose_k(flat, able, weights=w)
     k = int(count.k)
     seeds = histogram_seeds(flat, k, weights=w)
-    fit = fcm(flat, seeds.centers, sizes=True, weights=w)
+    # Sizes start from the plain fit: from raw seeds one may die before the centers have found their place.
+    fit = fcm(flat, count.partition.centers, sizes=True, weights=w)
     status |= Status(int(fit.status))
     labels = np.asarray(fit.labels)
     return Segmentation(
