@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.rays import Residual, View
+from jaxfuzzy.rays import Residual, View, columns
 
 EM_STEPS = 4
 HALF_LOG_2PI = 0.9189385332046727
@@ -34,13 +34,6 @@ class Mixture(NamedTuple):
     background: Array
     scale: Array
     ownership: Array
-
-
-def cost(residual: Residual, mask: Array, threshold: float) -> Array:
-    """Σ D / (D + c²), the objective of one fuzzy variety beside a noise cluster at distance c, for m = 2."""
-    square = (residual.error**2 + residual.miss**2) / threshold**2
-    total = (mask * (square / (1 + square))).sum(-1)
-    return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
 
 def mixture(residual: Residual, view: View, depth_range: Array, scale_bounds: tuple[float, float]) -> Mixture:
@@ -99,32 +92,41 @@ def cone_tapers(theta: Array, own: Array, height: Array) -> Array:
     return (ratio < 0.75) & (slope > 0.06) & (slope < 2.2)
 
 
-def faces_hold(residual: Residual, signs: Array, mixed: Mixture, view: View) -> Array:
-    """Every face of a box must hold 3.5 % of its inliers, eight points, and most of the points within its own extent."""
-    picture = _picture(view)
-    kept = jnp.ones(signs.shape[0], bool)
-    inliers = mixed.ownership.sum(-1) + 1e-9
-    for face in range(3):
-        met = (residual.part == face) * view.mask
-        own = met * mixed.ownership
-        total = own.sum(-1) + 1e-9
-        within = met
-        for coordinate in picture:
-            mean = (own * coordinate).sum(-1) / total
-            spread = jnp.sqrt(jnp.maximum((own * (coordinate - mean[:, None]) ** 2).sum(-1) / total, 1e-10))
-            within = within * (jnp.abs(coordinate - mean[:, None]) < 1.7 * spread[:, None])
-        filled = (own * within).sum(-1) / (within.sum(-1) + 1e-9) / (1 - mixed.background)
-        held = (total >= 0.035 * inliers) & (total >= 8.0) & (filled >= 0.6)
-        kept = kept & (held | (signs[:, face] == 0))
-    return kept
+def faces_hold(theta: Array, signs: Array, part: Array, ownership: Array, background: Array, view: View) -> Array:
+    """Every face of a box must hold 3.5 % of its inliers, eight points, and most of the points within its own extent.
+
+    Args:
+        theta: Boxes (H, 5).
+        signs: Their outward sides (H, 3).
+        part: Which face each point met (H, N).
+        ownership: Probability that it lies on it (H, N).
+        background: Share of background (H,).
+        view: The points, in the frame of each box.
+    """
+    face = jnp.arange(3)[None, :, None]
+    met = jnp.where(part[:, None] == face, view.mask, 0.0)
+    own = met * ownership[:, None]
+    total = own.sum(-1) + 1e-9
+    within = met
+    for coordinate in _picture(theta, view):
+        mean = (own * coordinate).sum(-1) / total
+        spread = jnp.sqrt(jnp.maximum((own * (coordinate - mean[..., None]) ** 2).sum(-1) / total, 1e-10))
+        within = within * (jnp.abs(coordinate - mean[..., None]) < 1.7 * spread[..., None])
+    filled = (own * within).sum(-1) / (within.sum(-1) + 1e-9) / (1 - background)[:, None]
+    inliers = ownership.sum(-1, keepdims=True) + 1e-9
+    held = (total >= 0.035 * inliers) & (total >= 8.0) & (filled >= 0.6)
+    return (held | (signs == 0)).all(-1)
 
 
-def _picture(view: View) -> tuple[Array, ...]:
-    """Coordinates in which a face's extent is judged: the picture's, or without a camera the place's."""
-    if view.ray is None:
-        return view.point
-    u, v, w = view.ray
-    return u / w, v / w
+def _picture(theta: Array, view: View) -> tuple[Array, Array]:
+    """Coordinates (H, 3, N) in which the extent of each face is judged: the picture's, or without a camera its own."""
+    if view.ray is not None:
+        u, v, w = columns(view.ray)
+        return (u / w)[:, None], (v / w)[:, None]
+    c, s = jnp.cos(theta[:, :1]), jnp.sin(theta[:, :1])
+    x, y, z = columns(view.point)
+    first, second = c * x + s * z, c * z - s * x
+    return jnp.stack([second, first, first], 1), jnp.stack([y, y, second], 1)
 
 
 def stout(radius: Array) -> Array:

@@ -64,6 +64,7 @@ def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: b
         polished = polish.polish(
             jnp.asarray(FAMILIES)[found.kind],
             jax.tree.map(take, found.candidates),
+            take(found.turn),
             view._replace(gain=view.gain / found.deviation.astype(dtype)),
             take(found.scale),
             take(found.background),
@@ -89,14 +90,10 @@ def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: b
 
 
 def _view(item: dict[str, Array], along_ray: bool) -> rays.View:
-    p, gain, mask = item["points"], item["gain"], item["weight"]
-    point = tuple(p[:, i][None] for i in range(3))
+    point, gain, mask = item["points"][None], item["gain"], item["weight"]
     if not along_ray:
         return rays.View(point, None, None, gain, mask)
-    d = p - item["eye"]
-    d = d / jnp.sqrt((d**2).sum(-1, keepdims=True))
-    eye = tuple(item["eye"][i][None, None] for i in range(3))
-    return rays.View(point, tuple(d[:, i][None] for i in range(3)), eye, gain, mask)
+    return rays.View(point, item["rays"][None], item["eye"][None], gain, mask)
 
 
 @partial(jax.jit, static_argnames="kind")

@@ -30,6 +30,7 @@ class Prepared(NamedTuple):
 
     Attributes:
         points: In its own frame, in the order in which they are sampled (N, 3).
+        rays: Unit direction of the viewing ray of each; zeros without a camera (N, 3).
         order: Which of the object's points each is (N,).
         gain: One over the deviation of each, in its own unit; right but for a common factor where not `given` (N,).
         weight: Weight of each (N,).
@@ -41,6 +42,7 @@ class Prepared(NamedTuple):
     """
 
     points: np.ndarray
+    rays: np.ndarray
     order: np.ndarray
     gain: np.ndarray
     weight: np.ndarray
@@ -89,10 +91,11 @@ def prepared(
     order = order[np.argsort(np.arange(len(p)) * GOLDEN % 1.0, kind="stable")]
     order = order[np.argsort(weight[order] == 0, kind="stable")]
     eye, depth = np.zeros(3), q[:, 2]
-    relative = np.ones(len(p))
+    ray, relative = np.zeros_like(q), np.ones(len(p))
     if along_ray and camera is not None:
         eye = turn @ (camera - middle) / (unit if unit > 0 else 1.0)
         depth = np.linalg.norm(q - eye, axis=1)
+        ray = (q - eye) / np.maximum(depth, 1e-12)[:, None]
         # Without a better word the deviation of stereo grows with the square of the distance.
         relative = (depth / np.average(depth, weights=weight)) ** 2
     gain = 1 / (relative if deviation is None else deviation / (unit if unit > 0 else 1.0))
@@ -101,6 +104,7 @@ def prepared(
     )
     return Prepared(
         points=q[order],
+        rays=ray[order],
         order=order,
         gain=gain[order],
         weight=weight[order],
@@ -117,16 +121,18 @@ def stacked(items: list[Prepared], dtype: Any) -> dict[str, np.ndarray]:
     capacity = padded(max(len(o.points) for o in items), CAPACITIES)
     count = padded(len(items), COUNTS)
     batch = {
-        "points": np.zeros((count, capacity, 3), dtype),
+        "points": np.zeros((count, 3, capacity), dtype),
+        "rays": np.zeros((count, 3, capacity), dtype),
         "gain": np.ones((count, capacity), dtype),
         "weight": np.zeros((count, capacity), dtype),
-        "eye": np.full((count, 3), -5.0, dtype),
+        "eye": np.zeros((count, 3), dtype),
         "depth_range": np.ones(count, dtype),
         "given": np.ones(count, bool),
     }
     for i, o in enumerate(items):
         n = len(o.points)
-        batch["points"][i, :n], batch["gain"][i, :n], batch["weight"][i, :n] = o.points, o.gain, o.weight
+        batch["points"][i, :, :n], batch["rays"][i, :, :n] = o.points.T, o.rays.T
+        batch["gain"][i, :n], batch["weight"][i, :n] = o.gain, o.weight
         batch["eye"][i], batch["depth_range"][i], batch["given"][i] = o.eye, o.depth_range, o.given
     return batch
 

@@ -14,8 +14,8 @@ from jax import lax
 from jaxfuzzy import rays, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.choice import HALF_LOG_2PI
-from jaxfuzzy.rays import Residual, View
-from jaxfuzzy.search import Candidates
+from jaxfuzzy.rays import Meeting, Residual, View
+from jaxfuzzy.candidates import Candidates
 
 MOST_STEPS = 40
 LEAN_PRIOR = 0.1745
@@ -48,30 +48,30 @@ class Polished(NamedTuple):
     moved: Array
 
 
-class _Look(NamedTuple):
-    """What one look at the points gives: derivatives (7, N), residual, its square, membership, and the residual's extras."""
-
-    rows: Array
-    error: Array
-    square: Array
-    own: Array
-    variance: Array
-    part: Array
-
-
 class _State(NamedTuple):
     step: Array
     theta: Array
     turn: Array
     scale: Array
     background: Array
-    look: _Look
+    met: Meeting
     moved: Array
+
+
+class _Look(NamedTuple):
+    """What one look at the points gives: derivatives (7, N), residual, its square and variance, membership."""
+
+    rows: Array
+    error: Array
+    square: Array
+    variance: Array
+    own: Array
 
 
 def polish(
     family: Array,
     candidate: Candidates,
+    turn: Array,
     view: View,
     scale: Array,
     background: Array,
@@ -84,6 +84,7 @@ def polish(
     Args:
         family: `PLANE`, `BOX`, `REVOLUTION` or `SPHERE`.
         candidate: Where to start, a single candidate without leading axis.
+        turn: Rotation into its frame (3, 3).
         view: All points.
         scale: Noise to start from.
         background: Share of background to start from.
@@ -96,23 +97,38 @@ def polish(
     free, dtype = candidate.free, view.gain.dtype
     prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / LEAN_PRIOR**2 * free
 
-    def surface(theta: Array, turn: Array) -> Residual:
-        seen, detail = rays.turned(view, turn[None]), candidate.detail[None]
+    detail = candidate.detail[None]
+
+    def meet(theta: Array, turn: Array) -> Meeting:
+        seen, ends = rays.turned(view, turn[None]), None if view.ray is None else detail
         families = (
-            lambda t: rays.plane(t, seen),
-            lambda t: rays.box(t, detail, seen),
-            lambda t: rays.revolution(t, None if view.ray is None else detail, seen),
-            lambda t: rays.sphere(t, seen),
+            lambda t: rays.meet_plane(t, seen),
+            lambda t: rays.meet_box(t, detail, seen),
+            lambda t: rays.meet_revolution(t, ends, seen),
+            lambda t: rays.meet_sphere(t, seen),
         )
         return lax.switch(family, families, theta[None])
 
-    def look(theta: Array, turn: Array, scale: Array, background: Array) -> _Look:
-        r = surface(theta, turn)
-        square = (r.error**2 + r.miss**2)[0]
-        on = jnp.log1p(-background) - 0.5 * (square / scale**2 + jnp.log(r.variance[0])) - jnp.log(scale) - HALF_LOG_2PI
-        own = jax.nn.sigmoid(on - jnp.log(background) - outside) * view.mask
+    def residual(theta: Array, turn: Array, met: Meeting) -> Residual:
+        seen = rays.turned(view, turn[None])
+        families = (
+            lambda t: rays.plane(t, seen, met),
+            lambda t: rays.box(t, detail, seen, met),
+            lambda t: rays.revolution(t, seen, met),
+            lambda t: rays.sphere(t, seen, met),
+        )
+        full = lambda f: (
+            lambda t: jax.tree.map(lambda a: jnp.broadcast_to(jnp.asarray(a, dtype), met.depth.shape), f(t))
+        )
+        return lax.switch(family, [full(f) for f in families], theta[None])
+
+    def look(state: _State) -> _Look:
+        r = residual(state.theta, state.turn, state.met)
+        square, scale = (r.error**2 + r.miss**2)[0], state.scale
+        on = -0.5 * (square / scale**2 + jnp.log(r.variance[0])) - jnp.log(scale) - HALF_LOG_2PI
+        odds = on + jnp.log1p(-state.background) - jnp.log(state.background) - outside
         rows = jnp.concatenate([*r.slopes, r.spins[0], r.spins[2]], 0) * free[:, None]
-        return _Look(rows, r.error[0], square, own, r.variance[0], r.part[0])
+        return _Look(rows, r.error[0], square, r.variance[0], jax.nn.sigmoid(odds) * view.mask)
 
     def normal(theta: Array, rows: Array, weight: Array, scale: Array) -> Array:
         matrix = (rows * weight) @ rows.T / scale**2 + jnp.diag(prior)
@@ -122,35 +138,35 @@ def polish(
         return matrix + jnp.diag(1e-9 * jnp.abs(jnp.diag(matrix)).max() + (1 - free))
 
     def step(state: _State) -> _State:
-        _, theta, turn, scale, background, seen, _ = state
+        theta, turn, scale, background = state.theta, state.turn, state.scale, state.background
+        seen = look(state)
         lean = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[1, 0] - turn[0, 1]])
         downhill = (seen.rows * seen.own) @ seen.error / scale**2 + prior * jnp.concatenate([jnp.zeros(5, dtype), lean])
         matrix = normal(theta, seen.rows, seen.own, scale)
         matrix = matrix + jnp.diag(1e-5 * jnp.diag(matrix))
-        first = state.step == 0
-        move = -starts.invert(matrix, downhill[:, None])[:, 0] * free
-        move = jnp.where(first, 0.0, jnp.clip(move, -0.2, 0.2))
+        move = jnp.clip(-starts.invert(matrix, downhill[:, None])[:, 0] * free, -0.2, 0.2)
         total = seen.own.sum()
         to_scale = jnp.clip(jnp.sqrt((seen.own * seen.square).sum() / (total + 1e-9)), *scale_bounds)
         to_background = jnp.clip(1 - total / count, 1e-3, 0.999)
-        to_scale, to_background = jnp.where(first, scale, to_scale), jnp.where(first, background, to_background)
         # Noise and share matter to the parameters only through the weights: a hundredth as much.
-        moved = jnp.maximum(
-            jnp.abs(move).max(), 0.01 * jnp.maximum(jnp.abs(to_scale - scale), jnp.abs(to_background - background))
-        )
+        noise = jnp.maximum(jnp.abs(to_scale - scale), jnp.abs(to_background - background))
+        moved = jnp.maximum(jnp.abs(move).max(), 0.01 * noise)
         theta, turn = theta + move[:5], starts.rotation(move[5], move[6]) @ turn
-        seen = look(theta, turn, to_scale, to_background)
-        return _State(state.step + 1, theta, turn, to_scale, to_background, seen, jnp.where(first, jnp.inf, moved))
+        return _State(state.step + 1, theta, turn, to_scale, to_background, meet(theta, turn), moved)
 
-    blank = jnp.zeros_like(view.gain)
-    nothing = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank, blank, jnp.zeros(len(blank), jnp.int32))
     start = _State(
-        jnp.asarray(0), candidate.theta, candidate.turn, scale, background, nothing, jnp.asarray(jnp.inf, dtype)
+        jnp.asarray(0),
+        candidate.theta,
+        turn,
+        scale,
+        background,
+        meet(candidate.theta, turn),
+        jnp.asarray(jnp.inf, dtype),
     )
     end = lax.while_loop(lambda s: (s.step < MOST_STEPS) & (s.moved > tolerance), step, start)
-    seen = end.look
+    seen = look(end)
     # ψ = own · e and its derivative, with d(own)/de = -own (1 - own) e / scale².
-    bend = seen.own * (1 - (1 - seen.own) * seen.error**2 / end.scale**2)
+    bend = seen.own * (1 - (1 - seen.own / jnp.maximum(view.mask, 1e-12)) * seen.error**2 / end.scale**2)
     inverse = jnp.linalg.inv(normal(end.theta, seen.rows, bend, end.scale))
     meat = (seen.rows * (seen.own * seen.error / end.scale) ** 2) @ seen.rows.T / end.scale**2
     return Polished(
@@ -160,7 +176,7 @@ def polish(
         background=end.background,
         covariance=inverse @ meat @ inverse.T * (free[:, None] * free),
         square=seen.square,
-        depth=-seen.error * jnp.sqrt(seen.variance) / view.gain,
-        part=seen.part,
+        depth=end.met.depth[0],
+        part=end.met.part[0],
         moved=end.moved,
     )

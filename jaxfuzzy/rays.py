@@ -31,99 +31,124 @@ class View(NamedTuple):
     """Points of an object as hypotheses see them, in units of the object's spread, its mean at the origin.
 
     Attributes:
-        point: Three coordinates, each (1, N), or (H, N) where every hypothesis has its own frame.
+        point: Places (1, 3, N), or (H, 3, N) where every hypothesis has its own frame.
         ray: Unit direction of each viewing ray, in the same form; None without a camera.
-        eye: Where the camera stands, three coordinates (1, 1) or (H, 1); None without a camera.
+        eye: Where the camera stands, (1, 3) or (H, 3); None without a camera.
         gain: One over each point's deviation (N,).
         mask: Weight of each point (N,), 0 for padding.
     """
 
-    point: tuple[Array, Array, Array]
-    ray: tuple[Array, Array, Array] | None
-    eye: tuple[Array, Array, Array] | None
+    point: Array
+    ray: Array | None
+    eye: Array | None
     gain: Array
     mask: Array
 
 
+class Meeting(NamedTuple):
+    """Where H surfaces meet N rays.
+
+    Attributes:
+        depth: From each point along its ray to the surface (H, N).
+        miss: How far a ray passes by, 0 where it meets the surface (H, N).
+        part: Which part of the surface was met, an integer (H, N).
+    """
+
+    depth: Array
+    miss: Array
+    part: Array
+
+
 class Residual(NamedTuple):
-    """Residuals of H hypotheses at N points.
+    """Residuals of H surfaces at N points.
 
     Attributes:
         error: Measured less predicted depth (or signed distance, inwards positive), in deviations.
-        miss: How far a ray passes by the surface, in deviations; 0 where it meets it.
+        miss: How far a ray passes by the surface, in deviations sideways.
+        variance: Of the error, in units of the point's own; on slanted surfaces errors sideways are errors of depth.
         slopes: Derivative of `error` by each of the five parameters, (H, N) each.
         spins: Derivative of `error` by a small turn of the points about x, y and z.
-        variance: Of the residual, in units of the point's own; slanted surfaces turn sideways errors into depth.
-        part: Which part of the surface was met, an integer.
     """
 
     error: Array
     miss: Array
+    variance: Array
     slopes: tuple[Array, ...]
     spins: tuple[Array, Array, Array]
-    variance: Array
-    part: Array
 
 
 def turned(view: View, rotation: Array) -> View:
     """The view in the frame of each hypothesis, `rotation` (H, 3, 3) applied to points, rays and camera."""
-    turn = lambda v: tuple(sum(rotation[:, i, j, None] * v[j] for j in range(3)) for i in range(3))
-    return view._replace(
-        point=turn(view.point),
-        ray=None if view.ray is None else turn(view.ray),
-        eye=None if view.eye is None else turn(view.eye),
+    turn = lambda v: (
+        None
+        if v is None
+        else jnp.einsum("hij,hj...->hi...", rotation, jnp.broadcast_to(v, (len(rotation), *v.shape[1:])))
     )
+    return view._replace(point=turn(view.point), ray=turn(view.ray), eye=turn(view.eye))
 
 
 def taken(view: View, count: int) -> View:
     """The first `count` points of a view whose points are in an order that makes any beginning a fair sample."""
-    cut = lambda v: None if v is None else tuple(c[:, :count] for c in v)
-    return view._replace(point=cut(view.point), ray=cut(view.ray), gain=view.gain[:count], mask=view.mask[:count])
+    ray = None if view.ray is None else view.ray[..., :count]
+    return view._replace(point=view.point[..., :count], ray=ray, gain=view.gain[:count], mask=view.mask[:count])
 
 
-def plane(theta: Array, view: View) -> Residual:
+def columns(vectors: Array) -> tuple[Array, Array, Array]:
+    """Three coordinates (G, N) of vectors (G, 3, N)."""
+    return vectors[:, 0], vectors[:, 1], vectors[:, 2]
+
+
+def meet_plane(theta: Array, view: View) -> Meeting:
     """Plane n·x = k, theta (H, 5) = (n, k, unused)."""
     n, k = tuple(theta[:, i, None] for i in range(3)), theta[:, 3, None]
-    length = jnp.sqrt(_dot(n, n) + TINY)
-    gap = (k - _dot(n, view.point)) / length
+    gap = k - _dot(n, columns(view.point))
     if view.ray is None:
-        cosine, depth, outward = jnp.ones_like(gap), -gap, 1.0
-        direction = tuple(-c / length for c in n)
-    else:
-        direction = view.ray
-        cosine = _dot(n, direction) / length
+        return _meeting(-gap * lax.rsqrt(_dot(n, n) + TINY))
+    toward = _dot(n, columns(view.ray))
+    steep = 0.02 * jnp.sqrt(_dot(n, n) + TINY)
+    return _meeting(gap / jnp.where(jnp.abs(toward) < steep, jnp.where(toward < 0, -steep, steep), toward))
+
+
+def plane(theta: Array, view: View, met: Meeting) -> Residual:
+    """Residuals of planes."""
+    n = tuple(theta[:, i, None] for i in range(3))
+    scale = lax.rsqrt(_dot(n, n) + TINY)
+    if view.ray is not None:
         # F must grow towards the camera, whichever way the normal points.
-        outward = jnp.where(cosine < 0, 1.0, -1.0)
-        cosine = jnp.maximum(jnp.abs(cosine), 0.02)
-        depth = -gap * outward / cosine
-    hit = _along(view.point, direction, depth)
-    normal = tuple(c * outward / length for c in n)
-    slopes = (*(c * outward / length for c in hit), -outward / length)
-    return _residual(view, depth, 0.0, cosine, cosine, hit, normal, slopes)
+        scale = jnp.where(_dot(n, columns(view.ray)) < 0, scale, -scale)
+    normal = tuple(c * scale for c in n)
+    direction = tuple(-c for c in normal) if view.ray is None else columns(view.ray)
+    hit = _along(columns(view.point), direction, met.depth)
+    return _residual(view, met, direction, hit, normal, (*(c * scale for c in hit), -scale, 0.0), 1.0)
 
 
-def sphere(theta: Array, view: View) -> Residual:
+def meet_sphere(theta: Array, view: View) -> Meeting:
     """Sphere, theta (H, 5) = (center, radius, unused)."""
     radius = jnp.abs(theta[:, 3, None]) + 1e-4
-    away = tuple(p - theta[:, i, None] for i, p in enumerate(view.point))
+    away = tuple(p - theta[:, i, None] for i, p in enumerate(columns(view.point)))
     square = _dot(away, away)
     if view.ray is None:
-        far = jnp.sqrt(square + TINY)
-        depth, miss, fall = far - radius, 0.0, radius
-        direction = tuple(-c / far for c in away)
+        return _meeting(jnp.sqrt(square + TINY) - radius)
+    half, constant = _dot(away, columns(view.ray)), square - radius**2
+    inside = half**2 - constant
+    root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
+    return _meeting(_nearer(1.0, half, constant, inside, root), jnp.maximum(-inside, 0.0) / (2 * radius))
+
+
+def sphere(theta: Array, view: View, met: Meeting) -> Residual:
+    """Residuals of spheres."""
+    radius = jnp.abs(theta[:, 3, None]) + 1e-4
+    if view.ray is not None:
+        direction = columns(view.ray)
     else:
-        direction = view.ray
-        half, constant = _dot(away, direction), square - radius**2
-        inside = half**2 - constant
-        root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
-        depth, fall = _nearer(jnp.ones_like(half), half, constant, inside, root), root
-        miss = jnp.maximum(-inside, 0.0) / (2 * radius)
-    hit = _along(away, direction, depth)
-    place = _along(view.point, direction, depth)
-    return _residual(view, depth, miss, fall, fall / radius, place, hit, (*(-c for c in hit), -radius), radius)
+        away = tuple(p - theta[:, i, None] for i, p in enumerate(columns(view.point)))
+        direction = tuple(-c * lax.rsqrt(_dot(away, away) + TINY) for c in away)
+    hit = _along(columns(view.point), direction, met.depth)
+    normal = tuple(h - theta[:, i, None] for i, h in enumerate(hit))
+    return _residual(view, met, direction, hit, normal, (*(-c for c in normal), -radius, 0.0), radius)
 
 
-def revolution(theta: Array, detail: Array | None, view: View) -> Residual:
+def meet_revolution(theta: Array, detail: Array | None, view: View) -> Meeting:
     """Cylinder or cone about y: theta (H, 5) = (x, z, radius at y = 0, how much it narrows a unit of y, level).
 
     Args:
@@ -133,60 +158,62 @@ def revolution(theta: Array, detail: Array | None, view: View) -> Residual:
         view: The points. The camera is above the rim.
     """
     a, b, r0, narrowing = (theta[:, i, None] for i in range(4))
-    x, y, z = view.point
+    x, y, z = columns(view.point)
     dx, dz, rim = x - a, z - b, r0 - narrowing * y
-    lean = lax.optimization_barrier(jnp.sqrt(1 + narrowing**2))
     if view.ray is None:
-        far = jnp.sqrt(dx**2 + dz**2 + TINY)
-        depth, miss = (far - rim) / lean, 0.0
-        direction = (-dx / far / lean, -narrowing / lean + 0 * far, -dz / far / lean)
-    else:
-        direction = u, v, w = view.ray
-        square = u * u + w * w - (narrowing * v) ** 2
-        half = dx * u + dz * w + narrowing * v * rim
-        constant = dx * dx + dz * dz - rim * rim
-        inside = half * half - square * constant
-        root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
-        depth = _nearer(square, half, constant, inside, root)
-        miss = jnp.maximum(-inside, 0.0)
-    inner: Array | float = 1.0
+        return _meeting((jnp.sqrt(dx**2 + dz**2 + TINY) - rim) * lax.rsqrt(1 + narrowing**2))
+    u, v, w = columns(view.ray)
+    square = u * u + w * w - (narrowing * v) ** 2
+    half = dx * u + dz * w + narrowing * v * rim
+    constant = dx * dx + dz * dz - rim * rim
+    inside = half * half - square * constant
+    root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
+    depth = _nearer(square, half, constant, inside, root)
     if detail is not None:
-        over = y + depth * v > jnp.where(detail[:, :1] == CLOSED, theta[:, 4, None], detail[:, 1, None])
+        level, top = theta[:, 4, None], detail[:, 1, None]
+        closed = detail[:, :1] == CLOSED
+        over = y + depth * v > jnp.where(closed, level, top)
         back = over & (detail[:, :1] == OPEN)
         depth = jnp.where(back, _farther(square, half, constant, root), depth)
-        inner = jnp.where(back, -1.0, 1.0)
-    hx, hy, hz = _along((dx, y, dz), direction, depth)
-    radius = r0 - narrowing * hy
-    floor = jnp.maximum(radius, 0.02 * jnp.abs(r0) + 1e-4)
-    if view.ray is None:
-        fall = floor * lean
+    height = y + depth * v
+    radius = r0 - narrowing * height
+    beside = jnp.maximum(-inside, 0.0) / (
+        2 * jnp.maximum(square, 0.05) * (jnp.maximum(radius, 0.0) + 0.02 * jnp.abs(r0))
+    )
+    miss = beside + jnp.maximum(-radius, 0.0)
+    if detail is None:
+        return _meeting(depth, miss)
+    # Over the rim: the lid of a closed body; of an open one the inner wall, down to the floor.
+    flat = (over & closed) | (back & (height < level))
+    down = jnp.maximum(-v, 0.02)
+    drop = (y - level) / down
+    outside = jnp.sqrt((dx + drop * u) ** 2 + (dz + drop * w) ** 2) - (r0 - narrowing * level)
+    miss = jnp.where(flat, jnp.maximum(outside, 0.0) * down + jnp.maximum(v, 0.0), miss)
+    miss = jnp.where(back & ~flat, miss + jnp.maximum(height - top, 0.0), miss)
+    return Meeting(jnp.where(flat, drop, depth), miss, jnp.where(flat, 1, jnp.where(back, 2, 0)))
+
+
+def revolution(theta: Array, view: View, met: Meeting) -> Residual:
+    """Residuals of bodies of revolution; parts are 0 for the side, 1 for lid or floor, 2 for the inner wall."""
+    a, b, r0, narrowing = (theta[:, i, None] for i in range(4))
+    if view.ray is not None:
+        direction = columns(view.ray)
     else:
-        fall = root
-        miss = miss / (2 * jnp.maximum(square, 0.05) * floor) + jnp.maximum(-radius, 0.0)
-    normal = (hx * inner, narrowing * radius * inner, hz * inner)
-    slopes = (-hx * inner, -hz * inner, -radius * inner, radius * hy * inner)
-    place, length, cosine, part = (hx + a, hy, hz + b), floor * lean, fall / (floor * lean), None
-    if detail is not None:
-        # Over the rim: the lid of a closed body; of an open one the inner wall down to the floor.
-        level = theta[:, 4, None]
-        down = jnp.maximum(-v, 0.02)
-        flat = (over & (detail[:, :1] == CLOSED)) | (back & (hy < level))
-        drop = (y - level) / down
-        fx, fz = dx + drop * u, dz + drop * w
-        beyond = jnp.sqrt(fx**2 + fz**2 + TINY) - (r0 - narrowing * level)
-        above = jnp.where(back & ~flat, jnp.maximum(hy - detail[:, 1, None], 0.0), 0.0)
-        miss = jnp.where(flat, jnp.maximum(beyond, 0.0) * down + jnp.maximum(v, 0.0), miss) + above
-        depth = jnp.where(flat, drop, depth)
-        fall, length = jnp.where(flat, down, fall), jnp.where(flat, 1.0, length)
-        cosine = jnp.where(flat, down, cosine)
-        place = tuple(jnp.where(flat, f, p) for f, p in zip((fx + a, level, fz + b), place, strict=True))
-        normal = tuple(jnp.where(flat, f, n) for f, n in zip((0.0, 1.0, 0.0), normal, strict=True))
-        slopes = (*(jnp.where(flat, 0.0, c) for c in slopes), jnp.where(flat, -1.0, 0.0))
-        part = jnp.where(flat, 1, jnp.where(back, 2, 0))
-    return _residual(view, depth, miss, fall, cosine, place, normal, slopes, length, part)
+        dx, dz = view.point[:, 0] - a, view.point[:, 2] - b
+        far, lean = lax.rsqrt(dx**2 + dz**2 + TINY), lax.rsqrt(1 + narrowing**2)
+        direction = (-dx * far * lean, -narrowing * lean * jnp.ones_like(far), -dz * far * lean)
+    hit = _along(columns(view.point), direction, met.depth)
+    flat, inner = met.part == 1, jnp.where(met.part == 2, -1.0, 1.0)
+    radius = (r0 - narrowing * hit[1]) * inner
+    hx, hz = (hit[0] - a) * inner, (hit[2] - b) * inner
+    side = lambda value: jnp.where(flat, 0.0, value)
+    normal = (side(hx), jnp.where(flat, 1.0, narrowing * radius), side(hz))
+    slopes = (side(-hx), side(-hz), side(-radius), side(radius * hit[1]), jnp.where(flat, -1.0, 0.0))
+    size = (jnp.abs(radius) + 0.02 * jnp.abs(r0) + 1e-4) * jnp.sqrt(1 + narrowing**2)
+    return _residual(view, met, direction, hit, normal, slopes, jnp.where(flat, 1.0, size))
 
 
-def box(theta: Array, signs: Array, view: View) -> Residual:
+def meet_box(theta: Array, signs: Array, view: View) -> Meeting:
     """Corner of a box, theta (H, 5) = (yaw, offsets of the faces along x', z', y, unused).
 
     The faces of a convex corner meet a ray in turn; the last one entered is the one seen.
@@ -196,73 +223,71 @@ def box(theta: Array, signs: Array, view: View) -> Residual:
         signs: Outward side of each face (H, 3), 0 for no face.
         view: The points.
     """
-    # Behind a barrier: else they are computed anew for every point.
-    c, s = lax.optimization_barrier((jnp.cos(theta[:, 0, None]), jnp.sin(theta[:, 0, None])))
-    x, y, z = view.point
-    across = (c * x + s * z, c * z - s * x, y)
-    side = tuple(signs[:, i, None] for i in range(3))
+    c, s = jnp.cos(theta[:, 0, None]), jnp.sin(theta[:, 0, None])
+    x, y, z = columns(view.point)
+    gap = (c * x + s * z - theta[:, 1, None], c * z - s * x - theta[:, 2, None], y - theta[:, 3, None])
     if view.ray is None:
-        fall = [jnp.where(side[i] != 0, 1.0, -1.0) for i in range(3)]
+        fall = tuple(jnp.where(signs[:, i, None] != 0, 1.0, -1.0) for i in range(3))
     else:
-        u, v, w = view.ray
-        fall = [-side[0] * (c * u + s * w), -side[1] * (c * w - s * u), -side[2] * v]
-    gaps = [side[i] * (across[i] - theta[:, 1 + i, None]) for i in range(3)]
-    reach = [jnp.where(fall[i] > 0.02, gaps[i] / jnp.maximum(fall[i], 0.02), -FAR) for i in range(3)]
+        u, v, w = columns(view.ray)
+        toward = (c * u + s * w, c * w - s * u, v)
+        fall = tuple(-signs[:, i, None] * toward[i] for i in range(3))
+    reach = tuple(
+        jnp.where(fall[i] > 0.02, signs[:, i, None] * gap[i] / jnp.maximum(fall[i], 0.02), -FAR) for i in range(3)
+    )
     depth = jnp.maximum(jnp.maximum(reach[0], reach[1]), reach[2])
-    own = (depth <= reach[0], depth <= reach[1], depth <= reach[2])
-    pick = lambda of: jnp.where(own[0], of[0], jnp.where(own[1], of[1], of[2]))
-    cosine = pick(fall)
-    unit = [jnp.where(own[0], side[0], 0.0), jnp.where(own[1] & ~own[0], side[1], 0.0)]
-    unit.append(jnp.where(own[0] | own[1], 0.0, side[2]))
-    normal = (c * unit[0] - s * unit[1], unit[2], s * unit[0] + c * unit[1])
-    direction = tuple(-n for n in normal) if view.ray is None else view.ray
-    # A ray that no face looks at is an outlier: far off, and without a say.
+    part = jnp.where(depth <= reach[0], 0, jnp.where(depth <= reach[1], 1, 2))
+    # A ray that no face looks at is an outlier, without a say: part 3.
     lost = depth <= -FAR
-    depth, cosine = jnp.where(lost, FAR, depth), jnp.maximum(cosine, 0.02)
-    hit = _along(view.point, direction, depth)
+    return Meeting(jnp.where(lost, FAR, depth), jnp.zeros_like(depth), jnp.where(lost, 3, part))
+
+
+def box(theta: Array, signs: Array, view: View, met: Meeting) -> Residual:
+    """Residuals of boxes; parts are the faces."""
+    c, s = jnp.cos(theta[:, 0, None]), jnp.sin(theta[:, 0, None])
+    unit = tuple(jnp.where(met.part == i, signs[:, i, None], 0.0) for i in range(3))
+    normal = (c * unit[0] - s * unit[1], unit[2], s * unit[0] + c * unit[1])
+    direction = tuple(-n for n in normal) if view.ray is None else columns(view.ray)
+    hit = _along(columns(view.point), direction, met.depth)
     spin = unit[0] * (c * hit[2] - s * hit[0]) - unit[1] * (c * hit[0] + s * hit[2])
-    slopes = tuple(jnp.where(lost, 0.0, column) for column in (spin, -unit[0], -unit[1], -unit[2]))
-    part = jnp.where(own[0], 0, jnp.where(own[1], 1, 2))
-    return _residual(view, depth, 0.0, cosine, cosine, hit, normal, slopes, part=part)
+    return _residual(view, met, direction, hit, normal, (spin, -unit[0], -unit[1], -unit[2], 0.0), 1.0)
 
 
 def _residual(
     view: View,
-    depth: Array,
-    miss: Array | float,
-    fall: Array,
-    cosine: Array,
+    met: Meeting,
+    direction: tuple[Array, ...],
     hit: tuple[Array, ...],
     normal: tuple[Array, ...],
     slopes: tuple[Array | float, ...],
-    length: Array | float = 1.0,
-    part: Array | None = None,
+    length: Array | float,
 ) -> Residual:
-    """Residual from depth along the ray, `fall` = -∇F·d and `length` = |∇F|, both at the hit."""
-    if view.ray is None:
-        variance, gain = jnp.ones_like(depth), view.gain * jnp.ones_like(depth)
-    else:
-        variance = 1 + SIDEWAYS**2 / (cosine**2 + GRAZING**2)
-        gain = view.gain * lax.rsqrt(variance)
+    """Residual from where a ray meets a surface: ∇F there (of the given length) and the derivatives of F."""
+    fall = -_dot(normal, direction)
+    variance = jnp.ones_like(met.depth)
+    if view.ray is not None:
+        variance = 1 + SIDEWAYS**2 / ((fall / length) ** 2 + GRAZING**2)
         fall = jnp.sqrt(fall**2 + (GRAZING * length) ** 2)
+    gain = view.gain * lax.rsqrt(variance)
     rate = -gain / fall
     x, y, z = hit
     p, q, r = normal
-    spins = ((y * r - z * q) * rate, (z * p - x * r) * rate, (x * q - y * p) * rate)
-    unused = (jnp.zeros_like(depth),) * (5 - len(slopes))
     return Residual(
-        error=-depth * gain,
-        miss=miss * view.gain / SIDEWAYS * jnp.ones_like(depth),
-        slopes=(*(column * rate for column in slopes), *unused),
-        spins=spins,
+        error=-met.depth * gain,
+        miss=met.miss * view.gain / SIDEWAYS,
         variance=variance,
-        part=jnp.zeros(depth.shape, jnp.int32) if part is None else part,
+        slopes=tuple(column * rate for column in slopes),
+        spins=((y * r - z * q) * rate, (z * p - x * r) * rate, (x * q - y * p) * rate),
     )
 
 
-def _nearer(square: Array, half: Array, constant: Array, inside: Array, root: Array) -> Array:
+def _meeting(depth: Array, miss: Array | None = None) -> Meeting:
+    return Meeting(depth, jnp.zeros_like(depth) if miss is None else miss, jnp.zeros(depth.shape, jnp.int32))
+
+
+def _nearer(square: Array | float, half: Array, constant: Array, inside: Array, root: Array) -> Array:
     """Where a ray enters t² square + 2 t half + constant = 0; its nearest place where it misses."""
-    safe = jnp.where(jnp.abs(square) < 1e-3, 1e-3, square)
+    safe = square if isinstance(square, float) else jnp.where(jnp.abs(square) < 1e-3, 1e-3, square)
     enter = jnp.where(half < 0, constant / (root - half), -(half + root) / safe)
     return jnp.where(inside < 0, -half / safe, enter)
 

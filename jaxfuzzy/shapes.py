@@ -216,9 +216,7 @@ def _on(look: Look) -> np.ndarray:
 def _ends(look: Look) -> np.ndarray:
     item, polished = look.item, look.fitted.polished
     n = len(item.points)
-    direction = item.points - item.eye
-    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True) if item.eye.any() else 0.0
-    hits = (item.points + polished.depth[:n, None] * direction) @ polished.turn.T
+    hits = (item.points + polished.depth[:n, None] * item.rays) @ polished.turn.T
     kind = KINDS[look.fitted.kind]
     return bounds.ends_of(kind, polished.theta, hits, polished.part[:n], _on(look), look.fitted.detail)
 

@@ -20,10 +20,12 @@ from jaxfuzzy.rays import View
 
 ANCHORS = 32
 COMPANY = 0.2
+# A lid is so many deviations thick to either side; where there is none it is up here.
+LID_THICKNESS, NOWHERE = 3.0, 1e3
 WIDTHS = (0.25, 0.5, 1.0)
 POWER_STEPS = 8
-FRONT_ANCHORS, FRONT_RADII, FRONT_NARROWING = 24, (0.2, 0.35, 0.55, 0.8, 1.1), (0.25, 0.6)
-BOX_ANCHORS, BOX_PLANES, BOX_YAWS = 24, 6, 10
+FRONT_ANCHORS, FRONT_RADII, FRONT_NARROWING = 12, (0.2, 0.35, 0.55, 0.8, 1.1), (0.25, 0.6)
+BOX_ANCHORS, BOX_PLANES, BOX_YAWS = 16, 5, 9
 LID_RADII, LID_NARROWING = (0.85, 0.92, 1.0, 1.08), (0.0, 0.25, -0.25, 0.5, -0.5)
 
 
@@ -38,14 +40,18 @@ class Windows(NamedTuple):
 
 
 def invert(matrix: Array, right: Array) -> Array:
-    """Solves symmetric positive definite systems (..., p, p) x = (..., p, k) by Gauss-Jordan, written out for small p."""
+    """Solves symmetric positive definite systems (..., p, p) x = (..., p, k) by Gauss-Jordan, for many small ones at once."""
     size = matrix.shape[-1]
     rows = jnp.concatenate([matrix, right], -1)
-    for k in range(size):
-        pivot = rows[..., k, :] / rows[..., k, k, None]
-        chosen = (np.arange(size) == k)[:, None]
-        rows = jnp.where(chosen, pivot[..., None, :], rows - rows[..., :, k, None] * pivot[..., None, :])
-    return rows[..., size:]
+
+    def eliminate(k: int, rows: Array) -> Array:
+        pivot = lax.dynamic_index_in_dim(rows, k, -2)
+        pivot = pivot / lax.dynamic_index_in_dim(pivot, k, -1)
+        column = lax.dynamic_index_in_dim(rows, k, -1)
+        chosen = (jnp.arange(size) == k)[:, None]
+        return jnp.where(chosen, pivot, rows - column * pivot)
+
+    return lax.fori_loop(0, size, eliminate, rows)[..., size:]
 
 
 def rotation(about_x: Array, about_z: Array) -> Array:
@@ -62,7 +68,7 @@ def rotation(about_x: Array, about_z: Array) -> Array:
 
 def dense(view: View) -> Array:
     """Which points have company: local density above a fifth of the largest. Uniform outliers have little (N,)."""
-    point = jnp.stack([c[0] for c in view.point], -1)
+    point = view.point[0].T
     square = ((point[:, None] - point) ** 2).sum(-1)
     company = (jnp.exp(-square / (2 * COMPANY**2)) * view.mask).sum(-1) * view.mask
     return (company > 0.2 * company.max()) & (view.mask > 0)
@@ -76,7 +82,7 @@ def first_of(wanted: Array, count: int) -> Array:
 
 def windows(view: View, anchors: Array, extra: Array) -> Windows:
     """Fits a plane and three tied bases in every window: round anchors (A, 3) in three widths, all points, `extra` (N,)."""
-    x, y, z = (c[0] for c in view.point)
+    x, y, z = view.point[0]
     square = sum((a[:, None] - c) ** 2 for a, c in zip(anchors.T, (x, y, z), strict=True))
     weight = [jnp.exp(-square / (2 * h * h)) for h in WIDTHS]
     weight = jnp.concatenate([*weight, jnp.ones_like(square[:1]), extra[None]]) * view.mask
@@ -140,10 +146,10 @@ def windows(view: View, anchors: Array, extra: Array) -> Windows:
 
 def front_lines(view: View, chosen: Array) -> tuple[Array, Array]:
     """Cylinders and cones that have an anchor on the line nearest to the camera, radii and slopes on a grid."""
-    anchor = jnp.stack([c[0][chosen] for c in view.point], -1)[:, None, :]
+    anchor = view.point[0].T[chosen][:, None, :]
     radii = jnp.asarray(FRONT_RADII, anchor.dtype)
     if view.ray is not None:
-        away = jnp.stack([view.ray[0][0][chosen], view.ray[2][0][chosen]], -1)[:, None, :]
+        away = view.ray[0].T[chosen][:, None, ::2]
     else:
         turn = np.arange(len(chosen)) * (np.pi * (3 - np.sqrt(5)))
         away = jnp.asarray(np.stack([np.cos(turn), np.sin(turn)], -1), anchor.dtype)[:, None, :]
@@ -204,7 +210,7 @@ def _signed(theta: Array, view: View, active: np.ndarray) -> tuple[Array, Array]
         quarters = np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]) * active
         signs = jnp.repeat(jnp.asarray(quarters, theta.dtype), len(theta), axis=0)
         return jnp.tile(theta, (4, 1)), signs
-    ex, ez = view.eye[0][0], view.eye[2][0]
+    ex, ez = view.eye[0, 0], view.eye[0, 2]
     c, s = jnp.cos(theta[:, 0]), jnp.sin(theta[:, 0])
     beyond = jnp.stack([c * ex + s * ez - theta[:, 1], c * ez - s * ex - theta[:, 2], jnp.ones_like(c)], -1)
     return theta, jnp.where(beyond > 0, 1.0, -1.0) * active
@@ -216,36 +222,52 @@ def _through(normal: Array, point: Array) -> Array:
     return jnp.concatenate([normal, offset, jnp.zeros_like(offset)], -1)
 
 
-def lid_bodies(view: View, below: Array, level: Array, on: Array) -> Array:
+class Lid(NamedTuple):
+    """The level surface that holds most points.
+
+    Attributes:
+        level: Its height; far up where there is none.
+        on: Which points lie on it (N,).
+        below: Which points with company lie below it (N,), all of them where there is none.
+    """
+
+    level: Array
+    on: Array
+    below: Array
+
+
+def lid(view: View, normal: Array, middle: Array, usable: Array, company: Array) -> Lid:
+    """Finds it among small pieces of surface.
+
+    Args:
+        view: The points.
+        normal: Normals of the pieces (W, 3).
+        middle: Their middles (W, 3).
+        usable: Which of them to trust (W,).
+        company: Which points have company (N,).
+    """
+    y = view.point[0, 1]
+    flat = jnp.where((jnp.abs(normal[:, 1]) > 0.9) & usable, middle[:, 1], NOWHERE)
+    near = jnp.abs(y - flat[:, None]) * view.gain < LID_THICKNESS
+    most = jnp.argmax((near & company).sum(-1))
+    on = near[most] & company
+    return Lid(flat[most], on, (company & (y < flat[most]) & ~on).astype(y.dtype))
+
+
+def lid_bodies(view: View, below: Array, lid: Lid) -> Array:
     """Bodies of revolution under a lid (H, 5): its points' mean and spread give the rim, a grid the rest.
 
     Args:
         view: The points.
         below: What fits the points below the lid (2, 5), a cylinder and a cone.
-        level: Height of the lid.
-        on: Which points lie on it (N,).
+        lid: The lid.
     """
-    x, _, z = (c[0] for c in view.point)
-    total = on.sum() + 1e-9
-    mx, mz = (on * x).sum() / total, (on * z).sum() / total
+    x, _, z = view.point[0]
+    total = lid.on.sum() + 1e-9
+    mx, mz = (lid.on * x).sum() / total, (lid.on * z).sum() / total
     # A disc has ⟨ρ²⟩ = r² / 2.
-    radius = jnp.sqrt(2 * (on * ((x - mx) ** 2 + (z - mz) ** 2)).sum() / total)
+    radius = jnp.sqrt(2 * (lid.on * ((x - mx) ** 2 + (z - mz) ** 2)).sum() / total)
     sizes, slopes = (c.ravel() for c in np.meshgrid(LID_RADII, LID_NARROWING))
     rim = radius * sizes
-    fields = (mx + 0 * rim, mz + 0 * rim, rim + slopes * level, 0 * rim + slopes, level + 0 * rim)
-    return jnp.concatenate([jnp.stack(fields, -1).astype(x.dtype), below.at[:, 4].set(level)])
-
-
-def lid_level(view: View, flat: Array, company: Array, clearance: float) -> tuple[Array, Array]:
-    """Height of the level surface that holds most points, and which points lie on it.
-
-    Args:
-        view: The points.
-        flat: Heights of small level pieces of surface (W,), NaN for other pieces.
-        company: Which points have company (N,).
-        clearance: Half the thickness of a level surface, in deviations.
-    """
-    y = view.point[1][0]
-    on = (jnp.abs(y - flat[:, None]) * view.gain < clearance) & company
-    level = flat[jnp.argmax(on.sum(-1))]
-    return level, (jnp.abs(y - level) * view.gain < clearance) & company
+    fields = (mx + 0 * rim, mz + 0 * rim, rim + slopes * lid.level, 0 * rim + slopes, lid.level + 0 * rim)
+    return jnp.concatenate([jnp.stack(fields, -1).astype(x.dtype), below.at[:, 4].set(lid.level)])

@@ -1,0 +1,190 @@
+"""Candidates of all families side by side, and their descent under the memberships of a falling noise distance."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxfuzzy import rays, starts
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.rays import Meeting, Residual, View
+
+
+class Counts(NamedTuple):
+    """How many candidates there are of each family, in this order."""
+
+    planes: int
+    boxes: int
+    bodies: int
+    spheres: int
+
+    def slices(self) -> tuple[slice, slice, slice, slice]:
+        """Where each family stands."""
+        ends = np.cumsum(self).tolist()
+        return tuple(slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True))  # type: ignore[return-value]
+
+
+class Candidates(NamedTuple):
+    """Surfaces of all families, one after the other: planes, boxes, bodies of revolution, spheres.
+
+    Attributes:
+        theta: Parameters as in `rays` (H, 5).
+        detail: Signs of a box, ends of a body of revolution (H, 3).
+        free: Which parameters may move, and whether the axis may lean about x and about z (H, 7).
+    """
+
+    theta: Array
+    detail: Array
+    free: Array
+
+    def take(self, index: Array) -> "Candidates":
+        """Some of them."""
+        packed = jnp.concatenate(self, -1)[index]
+        return Candidates(packed[..., :5], packed[..., 5:8], packed[..., 8:])
+
+
+def joined(groups: list[Candidates]) -> Candidates:
+    """One after the other."""
+    return Candidates(*(jnp.concatenate(c) for c in zip(*groups, strict=True)))
+
+
+def planes_of(theta: Array) -> Candidates:
+    """Planes, which do not lean."""
+    return _flagged(theta, jnp.zeros((len(theta), 3), theta.dtype), (1, 1, 1, 1, 0, 0, 0))
+
+
+def spheres_of(theta: Array) -> Candidates:
+    """Spheres, which do not lean."""
+    return planes_of(theta)
+
+
+def sides_of(theta: Array, cone: bool) -> Candidates:
+    """Endless sides of cylinders or cones."""
+    detail = jnp.broadcast_to(jnp.array([rays.SIDE, 1e3, 0.0], theta.dtype), (len(theta), 3))
+    return _flagged(theta, detail, (1, 1, 1, int(cone), 0, 1, 1))
+
+
+def vessels_of(theta: Array, ends: Array, rim: Array, cone: Array) -> Candidates:
+    """Cylinders or cones (H,) with kinds of ends (H,) and a rim (H,)."""
+    one = jnp.ones_like(rim)
+    free = (one, one, one, one * cone, one * (ends == rays.CLOSED), one, one)
+    return Candidates(theta, jnp.stack([ends * one, rim, 0 * one], -1), jnp.stack(free, -1))
+
+
+def boxes_of(theta: Array, signs: Array) -> Candidates:
+    """Boxes; a face that is not there cannot move."""
+    one = jnp.ones_like(signs[:, :1])
+    return Candidates(theta, signs, jnp.concatenate([one, jnp.abs(signs), 0 * one, one, one], 1))
+
+
+def _flagged(theta: Array, detail: Array, flags: tuple[int, ...]) -> Candidates:
+    return Candidates(theta, detail, jnp.broadcast_to(jnp.array(flags, theta.dtype), (len(theta), 7)))
+
+
+def _families(view: View, counts: Counts) -> list[View]:
+    cut = lambda v, family: v if v is None or len(v) == 1 else v[family]
+    return [view._replace(point=cut(view.point, f), ray=cut(view.ray, f)) for f in counts.slices()]
+
+
+def meet(candidates: Candidates, counts: Counts, view: View, lids: bool) -> Meeting:
+    """Where all candidates meet the rays; `lids` whether bodies of revolution may have ends."""
+    p, b, r, s = counts.slices()
+    seen = _families(view, counts)
+    theta, detail = candidates.theta, candidates.detail
+    each = (
+        rays.meet_plane(theta[p], seen[0]),
+        rays.meet_box(theta[b], detail[b], seen[1]),
+        rays.meet_revolution(theta[r], detail[r] if lids else None, seen[2]),
+        rays.meet_sphere(theta[s], seen[3]),
+    )
+    return Meeting(*(jnp.concatenate(c) for c in zip(*each, strict=True)))
+
+
+def look(candidates: Candidates, counts: Counts, view: View, met: Meeting) -> Residual:
+    """Residuals of all candidates."""
+    p, b, r, s = counts.slices()
+    seen = _families(view, counts)
+    theta = candidates.theta
+    part = lambda f: Meeting(*(c[f] for c in met))
+    each = (
+        rays.plane(theta[p], seen[0], part(p)),
+        rays.box(theta[b], candidates.detail[b], seen[1], part(b)),
+        rays.revolution(theta[r], seen[2], part(r)),
+        rays.sphere(theta[s], seen[3], part(s)),
+    )
+    join = lambda *a: jnp.concatenate(a)
+    return Residual(
+        join(*(e.error for e in each)),
+        join(*(e.miss for e in each)),
+        join(*(e.variance for e in each)),
+        tuple(join(*(e.slopes[i] for e in each)) for i in range(5)),
+        tuple(join(*(e.spins[i] for e in each)) for i in range(3)),
+    )
+
+
+class _State(NamedTuple):
+    candidates: Candidates
+    turns: Array | None
+    met: Meeting
+    cost: Array
+
+
+def descend(
+    candidates: Candidates,
+    counts: Counts,
+    turns: Array | None,
+    view: View,
+    thresholds: tuple[float, ...],
+    largest: float,
+    lids: bool,
+) -> tuple[Candidates, Array | None, Array]:
+    """One damped Gauss-Newton step a threshold, all candidates at once.
+
+    Args:
+        candidates: Where to start.
+        counts: How many of each family.
+        turns: Rotation into the frame of each (H, 3, 3), free to lean; None: all in the view's frame, which stays.
+        view: The points.
+        thresholds: Noise distances, in deviations.
+        largest: No parameter moves by more in a step.
+        lids: Whether bodies of revolution may have ends.
+
+    Returns:
+        Candidates, their rotations, and the objective of each before the last step.
+    """
+    # One look more than steps: at the first nothing is known yet of where rays meet surfaces, and nothing moves.
+    steps = jnp.asarray((thresholds[0], *thresholds), candidates.theta.dtype)
+    size = 5 if turns is None else 7
+    see = lambda turns: view if turns is None else rays.turned(view, turns)
+
+    def step(i: int, state: _State) -> _State:
+        now, turns, met, _ = state
+        # Where rays meet surfaces is carried from step to step, else the compiler works it out once for every derivative.
+        r = look(now, counts, see(turns), met)
+        square = (r.error**2 + r.miss**2) / steps[i] ** 2
+        u = 1 / (1 + square)
+        cost = (view.mask * square * u).sum(-1)
+        columns = [*r.slopes, r.error] if turns is None else [*r.slopes, r.spins[0], r.spins[2], r.error]
+        rows = jnp.stack(columns, 1) * (jnp.sqrt(view.mask) * u)[:, None]
+        move = _move(jnp.einsum("hin,hjn->hij", rows, rows), now.free[:, :size])
+        move = jnp.clip(move, -largest, largest) * (i > 0)
+        now = now._replace(theta=now.theta + move[:, :5])
+        turns = None if turns is None else starts.rotation(move[:, 5], move[:, 6]) @ turns
+        return _State(now, turns, meet(now, counts, see(turns), lids), cost)
+
+    blank = jnp.zeros((len(candidates.theta), len(view.gain)), candidates.theta.dtype)
+    nowhere = Meeting(blank, blank, blank.astype(jnp.int32))
+    start = _State(candidates, turns, nowhere, jnp.zeros_like(blank[:, 0]))
+    end = lax.fori_loop(0, len(steps), step, start)
+    return end.candidates, end.turns, end.cost
+
+
+def _move(normal: Array, free: Array) -> Array:
+    """The damped step from JᵀWJ and JᵀWe, stacked; parameters that are not free stay."""
+    size = normal.shape[-1] - 1
+    matrix = normal[:, :size, :size] * (free[:, :, None] * free[:, None, :])
+    diagonal = jnp.einsum("hii->hi", matrix)
+    damp = 1e-3 * diagonal + 1e-6 * diagonal.max(-1, keepdims=True) + (1 - free) + 1e-20
+    matrix = matrix + damp[:, :, None] * jnp.eye(size, dtype=normal.dtype)
+    return -starts.invert(matrix, (normal[:, :size, size] * free)[..., None])[..., 0] * free

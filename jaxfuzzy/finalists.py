@@ -1,0 +1,87 @@
+"""Finalists: the best of each kind after the coarse descent, and the same with tops, lids and open rims."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy import rays, starts
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.candidates import Candidates, Counts, boxes_of, joined, vessels_of
+from jaxfuzzy.rays import View
+from jaxfuzzy.screening import KEPT, SCREEN, absurd, best, price
+
+FINAL, CORNERS = 2, 4
+
+
+def finalists(
+    coarse: Candidates, cost: Array, counts: Counts, few: View, window: starts.Windows, company: Array, lid: starts.Lid
+) -> tuple[Candidates, Counts]:
+    """A few candidates of every kind.
+
+    Args:
+        coarse: The candidates after the coarse descent: boxes of two upright faces before those with a top, cylinders before cones.
+        cost: Their objectives.
+        counts: How many of each family.
+        few: The points.
+        window: Fits in windows.
+        company: Which points have company.
+        lid: The level surface that holds most points.
+    """
+    planes, boxes, bodies, spheres = counts.slices()
+    pick = lambda start, stop, count: start + best(cost[start:stop], count)
+    corners = pick(boxes.start, boxes.start + KEPT, CORNERS)
+    cylinders = pick(bodies.start, bodies.start + KEPT, FINAL)
+    cones = pick(bodies.start + KEPT, bodies.stop, FINAL)
+    height = few.point[0, 1][starts.first_of(company, starts.BOX_ANCHORS)]
+    corner = coarse.take(corners)
+    tops, signs = starts.box_tops(height, corner.theta, corner.detail)
+    top = best(price(rays.meet_box(tops, signs, few), few), FINAL)
+    plain = jnp.concatenate(
+        [
+            pick(planes.start, planes.stop, FINAL),
+            corners[:FINAL],
+            pick(boxes.start + KEPT, boxes.stop, 1),
+            cylinders,
+            cones,
+            pick(spheres.start, spheres.stop, FINAL),
+        ]
+    )
+    plain = coarse.take(plain)
+    cut = np.cumsum((FINAL, FINAL + 1, 2 * FINAL))
+    piece = lambda a, b: Candidates(*(c[a:b] for c in plain))
+    ended = (
+        []
+        if few.ray is None
+        else [_ended(coarse.theta[cylinders[0]], coarse.theta[cones[0]], few, window, height, lid)]
+    )
+    groups = [piece(0, cut[1]), boxes_of(tops[top], signs[top]), piece(cut[1], cut[2]), *ended, piece(cut[2], None)]
+    return joined(groups), Counts(FINAL, 2 * FINAL + 1, 2 * FINAL + sum(len(e.theta) for e in ended), FINAL)
+
+
+def _ended(
+    cylinder: Array, cone: Array, few: View, window: starts.Windows, height: Array, lid: starts.Lid
+) -> Candidates:
+    """The best lid and the best open rim for the best sides, and a cylinder and a cone under the best lid."""
+    floor = height.min()
+    # The cone that looks best from within.
+    within = window.cones[starts.ANCHORS :].at[:, 4].set(floor)
+    one = jnp.ones(len(within), few.gain.dtype)
+    looked = vessels_of(within, one * rays.OPEN, one * height.max(), one)
+    cost = price(rays.meet_revolution(within, looked.detail, few), few) + absurd(within[:, 2])
+    sides = jnp.stack([cylinder, cone, within[jnp.argmin(cost)]])
+    steep = jnp.array([0.0, 1.0, 1.0], few.gain.dtype)
+
+    # Each side with its rim at each height, with a lid and open.
+    tried = jnp.tile(height, 2 * len(sides))
+    ends = jnp.repeat(jnp.array([rays.CLOSED, rays.OPEN], few.gain.dtype), len(sides) * len(height))
+    many = jnp.tile(jnp.repeat(sides, len(height), axis=0), (2, 1))
+    many = many.at[:, 4].set(jnp.where(ends == rays.CLOSED, tried, floor))
+    rimmed = vessels_of(many, ends, tried, jnp.tile(jnp.repeat(steep, len(height)), 2))
+    cost = price(rays.meet_revolution(many, rimmed.detail, few), few).reshape(-1, len(height))
+    rimmed = rimmed.take(jnp.argmin(cost, -1) + jnp.arange(len(cost)) * len(height))
+
+    theta = starts.lid_bodies(few, jnp.stack([window.cylinders[-1], window.cones[-1]]), lid)
+    straight = theta[:, 3] == 0
+    lidded = vessels_of(theta, rays.CLOSED * jnp.ones_like(theta[:, 4]), theta[:, 4], ~straight)
+    cost = price(rays.meet_revolution(theta, lidded.detail, few), few, 2 * SCREEN) + absurd(theta[:, 2])
+    pair = jnp.stack([jnp.argmin(jnp.where(kept, cost, jnp.inf)) for kept in (straight, ~straight)])
+    return joined([rimmed, lidded.take(pair)])
