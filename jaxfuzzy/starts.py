@@ -213,7 +213,7 @@ def _signed(theta: Array, view: View, active: np.ndarray) -> tuple[Array, Array]
     ex, ez = view.eye[0, 0], view.eye[0, 2]
     c, s = jnp.cos(theta[:, 0]), jnp.sin(theta[:, 0])
     beyond = jnp.stack([c * ex + s * ez - theta[:, 1], c * ez - s * ex - theta[:, 2], jnp.ones_like(c)], -1)
-    return theta, jnp.where(beyond > 0, 1.0, -1.0) * active
+    return theta, jnp.where(beyond > 0, 1.0, -1.0) * jnp.asarray(active, theta.dtype)
 
 
 def _through(normal: Array, point: Array) -> Array:
