@@ -190,7 +190,7 @@ def meet_revolution(theta: Array, detail: Array | None, view: View) -> Meeting:
     outside = jnp.sqrt((dx + drop * u) ** 2 + (dz + drop * w) ** 2) - (r0 - narrowing * level)
     miss = jnp.where(flat, jnp.maximum(outside, 0.0) * down + jnp.maximum(v, 0.0), miss)
     miss = jnp.where(back & ~flat, miss + jnp.maximum(height - top, 0.0), miss)
-    return Meeting(jnp.where(flat, drop, depth), miss, jnp.where(flat, 1, jnp.where(back, 2, 0)))
+    return _meeting(jnp.where(flat, drop, depth), miss, jnp.where(flat, 1, jnp.where(back, 2, 0)))
 
 
 def revolution(theta: Array, view: View, met: Meeting) -> Residual:
@@ -239,7 +239,7 @@ def meet_box(theta: Array, signs: Array, view: View) -> Meeting:
     part = jnp.where(depth <= reach[0], 0, jnp.where(depth <= reach[1], 1, 2))
     # A ray that no face looks at is an outlier, without a say: part 3.
     lost = depth <= -FAR
-    return Meeting(jnp.where(lost, FAR, depth), jnp.zeros_like(depth), jnp.where(lost, 3, part))
+    return _meeting(jnp.where(lost, FAR, depth), None, jnp.where(lost, 3, part))
 
 
 def box(theta: Array, signs: Array, view: View, met: Meeting) -> Residual:
@@ -281,8 +281,9 @@ def _residual(
     )
 
 
-def _meeting(depth: Array, miss: Array | None = None) -> Meeting:
-    return Meeting(depth, jnp.zeros_like(depth) if miss is None else miss, jnp.zeros(depth.shape, jnp.int32))
+def _meeting(depth: Array, miss: Array | None = None, part: Array | int = 0) -> Meeting:
+    part = jnp.broadcast_to(jnp.asarray(part, jnp.int32), depth.shape)
+    return Meeting(depth, jnp.zeros_like(depth) if miss is None else miss, part)
 
 
 def _nearer(square: Array | float, half: Array, constant: Array, inside: Array, root: Array) -> Array:
