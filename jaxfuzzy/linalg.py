@@ -134,3 +134,13 @@ def _inverse_gaps(here: Array, there: Array, values: Array) -> Array:
     gap = here - there
     same = jnp.abs(gap) <= 8 * jnp.finfo(values.dtype).eps * jnp.abs(values).max()
     return jnp.where(same, 0.0, 1.0 / jnp.where(same, 1.0, gap))
+
+
+def orthogonal(rows: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The orthogonal matrix nearest to three nearly orthogonal rows, by Newton's iteration (Higham, SISC 7(4), 1986).
+
+    It is differentiable where a singular value decomposition is not: at rows that are orthogonal already.
+    """
+    for _ in range(8):
+        rows = (rows + jnp.linalg.inv(rows).T) / 2
+    return rows

@@ -11,6 +11,7 @@ directions off each variety: unlike eigenvectors these have no sign and cannot r
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -21,9 +22,10 @@ from jax import lax
 
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
-from jaxfuzzy.embedding import monomial_gradients, monomials, padded_tables
+from jaxfuzzy.embedding import monomial_gradients, monomials, padded_tables, size
 from jaxfuzzy.linalg import weighted_moments, weighted_range
 from jaxfuzzy.solve import Solver, fixed_point
+from jaxfuzzy.tiles import frame
 from jaxfuzzy.varietystep import (
     directions,
     divide_points,
@@ -58,8 +60,12 @@ class Varieties:
         status: Reasons to read this with care; see `describe`.
         m: Fuzzifier.
         noise_distance: Noise distance, infinite without a noise cluster.
-        scatter: Scatter of the embedded points about each center (eq. 16), divided by the sum of its weights.
-        slopes: Mean of ∇phi ∇phiᵀ under the same weights; n · scatter n / n · slopes n is a mean squared distance in metres.
+        origin: Mean of the points. With `unit` it makes the local frame (p - origin) / unit in which moments are kept, since
+            in the input's frame they lose digits far from its origin.
+        unit: RMS distance of the points from their mean.
+        local_centers: Centers of the embedded local points (eq. 15).
+        scatter: Their scatter about the centers (eq. 16), divided by the sum of its weights.
+        slopes: Mean of their ∇phi ∇phiᵀ under the same weights: n · scatter n / n · slopes n is a mean squared distance.
         bounds: Lowest and highest coordinates of each variety's inliers: their 2 % and 98 % quantiles, stretched as if they
             were spread evenly, so that one outlier moves nothing.
         embedding: Name of the embedding, or the names.
@@ -79,11 +85,37 @@ class Varieties:
     status: Int[Array, ""]
     m: Scalar
     noise_distance: Scalar
+    origin: Float[Array, " D"]
+    unit: Float[Array, ""]
+    local_centers: Float[Array, "C Q"]
     scatter: Float[Array, "C Q Q"]
     slopes: Float[Array, "C Q Q"]
     bounds: Float[Array, "C 2 D"]
     embedding: str | tuple[str, ...] = static()
     distance: str = static(default="geometric")
+
+    def pick(self, embedding: str) -> "Varieties":
+        """The varieties in one of several embeddings, without padding.
+
+        Raises:
+            ValueError: this embedding was not fitted.
+        """
+        names = (self.embedding,) if isinstance(self.embedding, str) else self.embedding
+        checks.choice(embedding, "embedding", names)
+        if isinstance(self.embedding, str):
+            return self
+        at, q = names.index(embedding), size(embedding, self.origin.shape[-1])
+        one = jax.tree.map(lambda leaf: leaf[at], self)
+        return replace(
+            one,
+            centers=one.centers[:, :q],
+            normals=one.normals[:, :q],
+            basis=one.basis[:, :q, : q - 1],
+            local_centers=one.local_centers[:, :q],
+            scatter=one.scatter[:, :q, :q],
+            slopes=one.slopes[:, :q, :q],
+            embedding=embedding,
+        )
 
 
 def nfcv(
@@ -224,13 +256,16 @@ def _fit_one(
     noisy = part.noise > u.max(axis=1)
     labels = jnp.where(noisy, -1, u.argmax(axis=1))
     used = weights > 0
-    clean = jnp.where(used[:, None], points, 0)
     share = powers(part.log_powers(m), weights)
-    _, scatter = weighted_moments(monomials(clean) @ table.T, share)
-    gradients = jnp.einsum("qm,nmd->nqd", table, monomial_gradients(clean))
+    mean, unit = lax.stop_gradient(frame(points, weights))
+    unit = jnp.where(unit > 0, unit, 1)
+    local = jnp.where(used[:, None], (points - mean) / unit, 0)
+    local_centers, scatter = weighted_moments(monomials(local) @ table.T, share)
+    gradients = jnp.einsum("qm,nmd->nqd", table, monomial_gradients(local))
     own = weights[:, None] * u * (labels[:, None] == jnp.arange(u.shape[1]))
     own = jnp.where(own.sum(axis=0) > 0, own, weights[:, None] * u)
-    normals, basis = directions(theta, place, scatter, task, span)
+    sums = moments(share, task)
+    normals, basis = directions(theta, place, sums[1], task, span)
     return Varieties(
         centers=place.origin + theta["centers"] @ place.back.T,
         normals=normals,
@@ -242,9 +277,12 @@ def _fit_one(
         inliers=~noisy,
         objective=jnp.where(used, part.objective(m), 0) @ weights * place.unit**2,
         steps=solution.steps,
-        status=status(theta, moments(share, task), task, points, ~noisy & used, solution.converged),
+        status=status(theta, sums, task, points, ~noisy & used, solution.converged),
         m=m,
         noise_distance=jnp.asarray(jnp.inf, points.dtype) if noise_distance is None else noise_distance,
+        origin=mean,
+        unit=unit,
+        local_centers=local_centers,
         scatter=scatter,
         slopes=jnp.einsum("cn,nqd,npd->cqp", shares_of_one(share), gradients, gradients),
         bounds=jax.vmap(jax.vmap(weighted_range, (1, None), 1), (None, 1))(points, own),

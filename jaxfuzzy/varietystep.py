@@ -242,7 +242,8 @@ def directions(
         single = task.across == 1
         off = jnp.where(single, jnp.outer(normal, normal), projector)
         along = jnp.diag(task.real.astype(off.dtype)) - off
-        ranked = along @ scatter @ along + (1 + jnp.trace(scatter)) * along
+        here = place.back @ scatter @ place.back.T
+        ranked = along @ here @ along + (1 + jnp.trace(here)) * along
         vectors = jnp.linalg.eigh(lax.stop_gradient(ranked))[1][:, ::-1][:, :span]
         mine = jnp.arange(span) < task.real.sum() - task.across
         return jnp.where(single, normal, 0), jnp.where(mine, vectors, 0)
