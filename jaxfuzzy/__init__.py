@@ -11,6 +11,7 @@ from jaxfuzzy.checks import DataError as DataError
 from jaxfuzzy.cloud import Cloud as Cloud
 from jaxfuzzy.cloud import read_cloud as read_cloud
 from jaxfuzzy.cloud import write_cloud as write_cloud
+from jaxfuzzy.conditioning import conditioning as conditioning
 from jaxfuzzy.fcm import NoiseRule as NoiseRule
 from jaxfuzzy.fcm import Partition as Partition
 from jaxfuzzy.fcm import fcm as fcm
@@ -25,6 +26,7 @@ from jaxfuzzy.primitives import Cylinder as Cylinder
 from jaxfuzzy.primitives import Plane as Plane
 from jaxfuzzy.primitives import Quadric as Quadric
 from jaxfuzzy.primitives import Sphere as Sphere
+from jaxfuzzy.recover import recover as recover
 from jaxfuzzy.reproject import cloud_from_disparity as cloud_from_disparity
 from jaxfuzzy.rig import Rig as Rig
 from jaxfuzzy.rig import load_rig as load_rig

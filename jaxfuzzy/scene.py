@@ -29,10 +29,12 @@ CAMERA_UP = (0.0, -1.0, 0.0)
 # How far in radians a supporting plane may lean from a vertical that was given.
 KNOWN_TILT = 0.15
 FEWEST_POINTS = 50
+# A group that rises above the ground by no more than this share of the highest one's height is part of the ground.
+FLAT = 0.05
 SEGMENT_OPTIONS = ("ks",)
 SHAPE_OPTIONS = ("kinds", "distance")
 # One word for both choices: how objects are counted, and how shapes are named.
-RULES = {
+RULES: dict[str, tuple[Any, Any]] = {
     "robust": ("robust", "likelihood"),
     "likelihood": ("robust", "likelihood"),
     "gric": ("robust", "gric"),
@@ -200,19 +202,28 @@ def _model(
         noise_distance = NOISE_SIGMAS * deviation
     segment_rule, shape_rule = RULES[rule]
     own = np.flatnonzero(kept)
-    noise = noise_distance if np.ndim(noise_distance) == 0 else jnp.asarray(noise_distance)[own]
-    seen = {"up": vertical, "camera": camera, "noise_distance": noise}
-    own_weights = None if heaviness is None else heaviness[own]
+
+    def seen(of: np.ndarray) -> dict[str, Any]:
+        """What both stages take beside the points."""
+        noise = noise_distance if np.ndim(noise_distance) == 0 else jnp.asarray(noise_distance)[of]
+        own_weights = None if heaviness is None else heaviness[of]
+        return {"up": vertical, "camera": camera, "noise_distance": noise, "weights": own_weights}
+
     with clock.stage("objects"):
         if len(own) < FEWEST_POINTS:
             raise checks.DataError(
                 f"only {len(own)} of {count} points stand above the ground, {FEWEST_POINTS} are needed"
             )
         picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
-        parts = segment(points[own], rule=segment_rule, weights=own_weights, **seen, **picked)
+        parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
+        if plane is not None:
+            standing = _standing(np.asarray(points[own]), np.asarray(parts.labels), plane)
+            if not standing.all():
+                own = own[standing]
+                parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
-        shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, weights=own_weights, **seen, **picked)
+        shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, **seen(own), **picked)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,
@@ -236,6 +247,18 @@ def load_scene(folder: str | Path) -> Scene:
     from jaxfuzzy import report
 
     return report.load(folder)
+
+
+def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane) -> np.ndarray:
+    """Which points belong to no group that lies flat on the ground.
+
+    Matching errs by more than its noise over wide smooth surfaces, so patches of the table may float above their own noise. What
+    nowhere rises above the ground by more than a share of the highest object's height is such a patch, not an object.
+    """
+    height = (points - np.asarray(ground.point)) @ np.asarray(ground.normal)
+    rises = [np.quantile(height[labels == k], 0.95) for k in range(labels.max() + 1)]
+    flat = np.flatnonzero(np.array(rises) < FLAT * max(rises, default=0.0))
+    return ~np.isin(labels, flat)
 
 
 def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:
