@@ -120,6 +120,7 @@ def frustum(made: str, low: float, high: float, height: float, lid: str) -> Body
 
 
 def box(half: np.ndarray) -> Body:
+    """A box of half edges `half` (3,), standing on the origin."""
     height = 2 * half[1]
 
     def cast(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,6 +162,7 @@ def _plane(half: np.ndarray, pitch: float) -> Body:
 
 
 def ellipsoid(made: str, half: np.ndarray) -> Body:
+    """An ellipsoid of half axes `half` (3,), standing on the origin; `made` names it."""
     middle = np.array([0.0, half[1], 0.0])
 
     def cast(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

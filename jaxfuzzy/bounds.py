@@ -36,7 +36,9 @@ def stretch(values: np.ndarray) -> tuple[float, float, float]:
     return float(x[low] - spacing), float(x[high] + spacing), float(spacing)
 
 
-def ends_of(kind: str, theta: np.ndarray, hits: np.ndarray, part: np.ndarray, on: np.ndarray, signs: np.ndarray):
+def ends_of(
+    kind: str, theta: np.ndarray, hits: np.ndarray, part: np.ndarray, on: np.ndarray, signs: np.ndarray
+) -> np.ndarray:
     """Ends (low, high, error) (3, 3) of a surface in its own frame, unit free.
 
     Args:

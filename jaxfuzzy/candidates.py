@@ -114,12 +114,13 @@ def look(candidates: Candidates, counts: Counts, view: View, met: Meeting) -> Re
         rays.sphere(theta[s], seen[3], part(s)),
     )
     join = lambda *a: jnp.concatenate(a)
+    spin = lambda i: join(*(e.spins[i] for e in each))
     return Residual(
         join(*(e.error for e in each)),
         join(*(e.miss for e in each)),
         join(*(e.variance for e in each)),
         tuple(join(*(e.slopes[i] for e in each)) for i in range(5)),
-        tuple(join(*(e.spins[i] for e in each)) for i in range(3)),
+        (spin(0), spin(1), spin(2)),
     )
 
 

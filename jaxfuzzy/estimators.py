@@ -147,7 +147,12 @@ class FuzzyCMeans(_Fuzzy):
     def fit(self, X: Any, y: Any = None, sample_weight: Any = None) -> Self:
         """Fits the clusters. `y` is not used."""
         points, weights = self._points(X, sample_weight, reset=True)
-        options: dict[str, Any] = {"m": self.m, "sizes": self.sizes, "noise_distance": self.noise_distance, "weights": weights}
+        options: dict[str, Any] = {
+            "m": self.m,
+            "sizes": self.sizes,
+            "noise_distance": self.noise_distance,
+            "weights": weights,
+        }
         with jax.enable_x64(True):
             solver = Solver(int(self.max_iter), float(self.tol))
             starts = [np.asarray(histogram_seeds(points, int(self.n_clusters), weights=weights).centers)]

@@ -45,9 +45,9 @@ def finalists(
             pick(spheres.start, spheres.stop, FINAL),
         ]
     )
-    plain = coarse.take(plain)
+    upright = coarse.take(plain)
     cut = np.cumsum((FINAL, FINAL + 1, 2 * FINAL))
-    piece = lambda a, b: Candidates(*(c[a:b] for c in plain))
+    piece = lambda a, b: Candidates(*(c[a:b] for c in upright))
     ended = (
         []
         if few.ray is None

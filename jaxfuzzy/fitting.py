@@ -14,7 +14,7 @@ from jaxfuzzy.primitives import Primitive
 
 FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
 # Noise of a surface in units of the points' deviation may be found to be so small or large.
-SCALES = (0.2, 4.0)
+SCALES = (0.2, 8.0)
 # A surface stands still when nothing moves by more, in units of the object's spread.
 TOLERANCES = {jnp.dtype(jnp.float32): 1e-5, jnp.dtype(jnp.float64): 1e-9}
 

@@ -15,7 +15,7 @@ from jaxfuzzy import starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.rays import View
 
-WIDTH = 0.2
+WIDTH = 0.3
 STEPS = 6
 # For normal residuals of deviation s the mean of e² / (e² + s²) is 1 - sqrt(π/2) exp(½) erfc(sqrt(½)).
 NORMAL_MEAN = 0.34432
@@ -108,8 +108,8 @@ def lean(view: View, found: Patches) -> Array:
     """How an object leans, from the normals of small windows: the rotation (3, 3) into a frame in which its axis is y.
 
     The normals of the side of a cylinder or box are square to the axis, n·(t₁, 1, t₂) = 0; those of a cone keep one angle with it,
-    n·(t₁, 1, t₂) = c; those of a lid or top are the axis itself. Both readings are solved by reweighting, and the cone's is taken only where it
-    fits much better.
+    n·(t₁, 1, t₂) = c; those of a lid or top are the axis itself. Both readings are solved by
+    reweighting, and the cone's is taken only where it fits much better.
 
     Args:
         view: The points.

@@ -11,16 +11,14 @@ import jax
 import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
-from jaxfuzzy.objects import Prepared, prepared, stacked
+from jaxfuzzy.objects import DEVIATIONS, Prepared, prepared, stacked
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
 FEWEST = 12
-# Noise of a surface over that of small windows from which on it is refused; right ones of 1 and 4 mm noise stay below 1.3,
-# wrong ones above 1.35 in nine cases of ten.
-MISFIT = 1.35
-# A given noise is believed unless small windows show several times as much.
-DOUBT = 2.5
+# A surface is refused where its noise exceeds so many times that of small windows, and so much of the object's spread: real
+# boxes and tins bulge and dent by that.
+MISFIT, BULGE = 1.35, 0.042
 # Noise over spread of the points from which on there is no surface to speak of.
 HOPELESS = 0.35
 # Least share of an object's points that must lie on its surface.
@@ -94,13 +92,13 @@ def _reason(item: Prepared, found: Fitted) -> Status:
     """Why the best surface is refused; 0 where it is not."""
     p = found.polished
     noise = p.scale * found.deviation * np.median(1 / item.gain)
-    on = item.weight @ (p.square[: len(item.points)] <= 6.25 * max(1.0, p.scale) ** 2)
+    on = item.weight @ (p.square[: len(item.points)] <= (DEVIATIONS * max(1.0, float(p.scale))) ** 2)
     if not found.passed.any() or not np.isfinite(p.theta).all():
         return Status.REFUSED
     if noise > HOPELESS or on < max(FEWEST / 2, LEAST_SHARE * item.weight.sum()):
         return Status.ALL_NOISE | Status.REFUSED
-    believed = float(np.clip(found.local, 1.0, DOUBT)) if item.given else 1.0
-    return Status.REFUSED if p.scale > MISFIT * believed else Status(0)
+    expected = max(1.0, float(found.local)) * found.deviation * np.median(1 / item.gain)
+    return Status.REFUSED if noise > np.hypot(MISFIT * expected, BULGE) else Status(0)
 
 
 def _best(look: Look) -> float:

@@ -13,9 +13,9 @@ from jax import lax
 
 from jaxfuzzy import rays, starts
 from jaxfuzzy.arrays import Array
+from jaxfuzzy.candidates import Candidates
 from jaxfuzzy.choice import HALF_LOG_2PI
 from jaxfuzzy.rays import Meeting, Residual, View
-from jaxfuzzy.candidates import Candidates
 
 MOST_STEPS = 40
 LEAN_PRIOR = 0.1745

@@ -79,12 +79,12 @@ class Residual(NamedTuple):
 
 def turned(view: View, rotation: Array) -> View:
     """The view in the frame of each hypothesis, `rotation` (H, 3, 3) applied to points, rays and camera."""
-    turn = lambda v: (
-        None
-        if v is None
-        else jnp.einsum("hij,hj...->hi...", rotation, jnp.broadcast_to(v, (len(rotation), *v.shape[1:])))
-    )
-    return view._replace(point=turn(view.point), ray=turn(view.ray), eye=turn(view.eye))
+
+    def turn(v: Array) -> Array:
+        return jnp.einsum("hij,hj...->hi...", rotation, jnp.broadcast_to(v, (len(rotation), *v.shape[1:])))
+
+    ray, eye = (None if v is None else turn(v) for v in (view.ray, view.eye))
+    return view._replace(point=turn(view.point), ray=ray, eye=eye)
 
 
 def taken(view: View, count: int) -> View:
@@ -138,6 +138,7 @@ def meet_sphere(theta: Array, view: View) -> Meeting:
 def sphere(theta: Array, view: View, met: Meeting) -> Residual:
     """Residuals of spheres."""
     radius = jnp.abs(theta[:, 3, None]) + 1e-4
+    direction: tuple[Array, ...]
     if view.ray is not None:
         direction = columns(view.ray)
     else:

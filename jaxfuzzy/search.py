@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jaxfuzzy import choice, local, starts
 from jaxfuzzy.arrays import Array
@@ -24,7 +23,7 @@ PATCHES = 24
 COARSE = tuple(np.geomspace(4.0, 2.5, 6))
 FINE = tuple(np.geomspace(3.0, 2.5, 4))
 # A noise scale beyond explains nothing better; its lower end keeps the mixture from settling on a few points.
-SCALES = (0.35, 1.6)
+SCALES = (0.35, 2.5)
 # Of the spread of an object: below lies the rounding of single precision.
 LEAST_DEVIATION = 2e-5
 
@@ -81,8 +80,9 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: A
     coarse, counts = screened(few, window, company)
     coarse, _, cost = descend(coarse, counts, None, few, COARSE, 0.5, False)
     fine, counts = finalists(coarse, cost, counts, few, window, company, lid)
-    turns = jnp.broadcast_to(turn, (len(fine.theta), 3, 3))
-    fine, turns, _ = descend(fine, counts, turns, more, FINE, 0.2, view.ray is not None)
+    upright = jnp.broadcast_to(turn, (len(fine.theta), 3, 3))
+    fine, turns, _ = descend(fine, counts, upright, more, FINE, 0.2, view.ray is not None)
+    assert turns is not None
     return _choose(fine, turns, counts, more, depth_range, allowed, gric)._replace(
         deviation=deviation,
         local=typical / deviation,

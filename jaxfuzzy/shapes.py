@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import bounds, checks
@@ -167,7 +168,7 @@ def fit_shapes(
     settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype)
     poor = [unfit(o) for o in objects]
     fit = [i for i, status in enumerate(poor) if not status]
-    looks = dict(zip(fit, look_at([o for o in objects if not unfit(o)], settings), strict=True))
+    looks = dict(zip(fit, look_at([o for o in objects if o is not None and not unfit(o)], settings), strict=True))
     return _shapes(looks, poor, [len(m) for m in members], settings)
 
 
@@ -203,14 +204,14 @@ def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settin
         else:
             status = poor[i] or looks[i].reason
             shapes.append(_unknown(size, looks.get(i), Status(status), settings))
-    return tuple(jax.device_put(shapes))
+    return tuple(shapes)
 
 
 def _on(look: Look) -> np.ndarray:
     """Which points lie on the surface, in the order of the search: those whose noise membership is not the larger."""
     scale = 1.0 if look.item.given else float(look.fitted.polished.scale)
     n = len(look.item.points)
-    return (look.fitted.polished.square[:n] <= (DEVIATIONS * scale) ** 2) & (look.item.weight > 0)
+    return (np.asarray(look.fitted.polished.square)[:n] <= (DEVIATIONS * scale) ** 2) & (look.item.weight > 0)
 
 
 def _ends(look: Look) -> np.ndarray:
@@ -218,7 +219,8 @@ def _ends(look: Look) -> np.ndarray:
     n = len(item.points)
     hits = (item.points + polished.depth[:n, None] * item.rays) @ polished.turn.T
     kind = KINDS[look.fitted.kind]
-    return bounds.ends_of(kind, polished.theta, hits, polished.part[:n], _on(look), look.fitted.detail)
+    theta, part, detail = map(np.asarray, (polished.theta, polished.part[:n], look.fitted.detail))
+    return bounds.ends_of(kind, theta, hits, part, _on(look), detail)
 
 
 def _assembled(
@@ -262,13 +264,13 @@ def _shape(look: Look, primitive: Primitive, covariance: np.ndarray, settings: S
     deviation = np.median(1 / item.gain) * fitted.deviation * item.frame.unit * scale
     return Shape(
         primitive=primitive,
-        inliers=inliers,
-        noise_distance=np.asarray(DEVIATIONS * deviation, settings.dtype),
+        inliers=jnp.asarray(inliers),
+        noise_distance=jnp.asarray(DEVIATIONS * deviation, settings.dtype),
         scores=scores,
         margin=margin,
         counts={},
-        covariance=covariance,
-        status=np.asarray(status, np.int32),
+        covariance=jnp.asarray(covariance),
+        status=jnp.asarray(int(status), jnp.int32),
         kind=kind,
         guards=guards,
     )
@@ -285,15 +287,16 @@ def _told(fitted: Fitted, kinds: tuple[str, ...]) -> tuple[dict[str, float], flo
 
 def _unknown(size: int, look: Look | None, status: Status, settings: Settings) -> Shape:
     scores, margin, guards = ({}, 0.0, ()) if look is None else _told(look.fitted, settings.kinds)
+    used = 0.0 if look is None else DEVIATIONS * float(np.median(1 / look.item.gain)) * float(look.item.frame.unit)
     return Shape(
         primitive=None,
-        inliers=np.zeros(size, bool),
-        noise_distance=np.asarray(np.nan, settings.dtype),
+        inliers=jnp.zeros(size, bool),
+        noise_distance=jnp.asarray(used, settings.dtype),
         scores=scores,
         margin=margin,
         counts={},
-        covariance=np.zeros((0, 0), settings.dtype),
-        status=np.asarray(status, np.int32),
+        covariance=jnp.zeros((0, 0), settings.dtype),
+        status=jnp.asarray(int(status), jnp.int32),
         kind="unknown",
         guards=guards,
     )

@@ -1,7 +1,7 @@
 """Starts: many rough guesses of every kind for the surface of an object, from small windows of its points.
 
-A window is a Gaussian weight round an anchor point, or all points. In each, a plane and three tied bases (section 3 of the embeddings:
-cylinder, sphere, and x² + z² with a linear y for cones) are fitted by Taubin's generalised eigenproblem; moved to the window's mean,
+A window is a Gaussian weight round an anchor point, or all points. In each, a plane and three tied bases (those of the embeddings
+cylinder, sphere, and x² + z² with a linear y for cones) are fitted by Taubin's generalised eigenproblem; moved to its mean,
 the gradient matrix of a tied basis is diagonal, so that one matrix product of moments and a few power steps on a written-out
 inverse serve all windows and bases at once. Guesses that windows cannot make come from the camera: an anchor as the front line
 of a cylinder or cone, or as a point on a box's second face.
@@ -84,8 +84,8 @@ def windows(view: View, anchors: Array, extra: Array) -> Windows:
     """Fits a plane and three tied bases in every window: round anchors (A, 3) in three widths, all points, `extra` (N,)."""
     x, y, z = view.point[0]
     square = sum((a[:, None] - c) ** 2 for a, c in zip(anchors.T, (x, y, z), strict=True))
-    weight = [jnp.exp(-square / (2 * h * h)) for h in WIDTHS]
-    weight = jnp.concatenate([*weight, jnp.ones_like(square[:1]), extra[None]]) * view.mask
+    windows = [jnp.exp(-square / (2 * h * h)) for h in WIDTHS]
+    weight = jnp.concatenate([*windows, jnp.ones_like(square[:1]), extra[None]]) * view.mask
     # Moments of (x²+z², y², x, z, y, 1), all windows in one product.
     terms = jnp.stack([x * x + z * z, y * y, x, z, y, jnp.ones_like(x)], -1)
     pairs = np.array([(i, j) for i in range(6) for j in range(i, 6)])
