@@ -18,11 +18,13 @@ from jaxfuzzy.validity import ClusterCount, choose_k
 # "auto" allows so many objects.
 MOST = 20
 # Bandwidth over (spacing² · size)^(1/3), spacing that of the points on their surface, size that of the surface.
-BANDWIDTH = 2.05
-# Points beyond this number are gathered in cells of a third of the bandwidth; the sizes that are compiled.
-CAPACITIES = (256, 512, 1024, 2048, 4096)
+BANDWIDTH = 1.9
+# Points are gathered in cells of a third of the bandwidth; numbers of cells that are compiled.
+CAPACITIES = (512, 1024, 2048, 4096)
+# A scene too wide for its detail is looked at with a wider bandwidth.
+COARSER = 1.25
 # The spacing is measured at so many points, among so many, by the distance to this neighbour; a low quantile leaves outliers out.
-PROBES, CROWD, NEIGHBOUR, QUANTILE, ALONE = 192, 4096, 8, 0.2, 2.5
+PROBES, CROWD, NEIGHBOUR, QUANTILE, ALONE = 192, 3072, 8, 0.2, 2.5
 
 
 @record
@@ -108,14 +110,20 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
     flat = (x - np.average(x, axis=0, weights=w)) @ axes.T
     turn = np.linalg.eigh((flat * w[:, None]).T @ flat)[1]
     flat = flat @ turn
-    places, weight, cell = _places(flat, w, bandwidth)
-    allowed = np.isin(np.arange(1, candidates[-1] + 1), candidates)
-    groups = part(
-        jnp.asarray(places, x.dtype),
-        jnp.asarray(weight, x.dtype),
-        jnp.asarray(bandwidth, x.dtype),
-        jnp.asarray(allowed),
-    )
+    allowed = jnp.asarray(np.isin(np.arange(1, candidates[-1] + 1), candidates))
+    box = jnp.asarray(np.quantile(flat[w > 0], [0.01, 0.99], axis=0), x.dtype)
+    groups = None
+    while groups is None:
+        places, weight, cell = _places(flat, w, bandwidth)
+        groups = part(
+            jnp.asarray(places, x.dtype),
+            jnp.asarray(weight, x.dtype),
+            box,
+            jnp.asarray(bandwidth, x.dtype),
+            allowed,
+        )
+        if groups is None:
+            bandwidth *= COARSER
     k = int(groups.count)
     shares = np.asarray(groups.shares)[cell, :k]
     # Noise takes as much of a point as its best object does where its support is just enough, and more with less support.
@@ -174,7 +182,7 @@ def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarr
     """The points as few enough weighted places, padded; and the place of each point."""
     most = CAPACITIES[-1]
     real = np.flatnonzero(w > 0)
-    pitch = bandwidth / 3
+    pitch = bandwidth / 2
     while True:
         corner = np.floor(np.clip(flat / pitch, -1e9, 1e9)).astype(np.int64)
         key = (corner[:, 0] - corner[:, 0].min()) * (np.ptp(corner[:, 1]) + 1) + corner[:, 1] - corner[:, 1].min()
