@@ -8,6 +8,8 @@ them belong together unless the support of the plane has a valley between them. 
 a count of points, so that a valley can be told from chance: the square root of a Poisson count has the same spread everywhere.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +18,8 @@ from jax import lax
 from jaxfuzzy.arrays import Array, Bool, Float, Int, record
 
 # Small clusters that tile the objects (the sizes compiled); neighbours each is compared with, at so many places on the way.
-PROTOTYPES, NEIGHBOURS, STOPS = (64, 128), 4, 5
+PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
 SWEEPS = 10
-# The prototypes do not suffice when support above this share of the mean is left without one.
-UNTILED = 0.3
 # Bandwidths that the number of groups is looked for at: two ladders of a factor 2 in h², interleaved, over the first one's base.
 LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
 BASE = 2
@@ -78,13 +78,11 @@ def part(
         bandwidth: Bandwidth h of the support.
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
     """
-    tiling = _tile(places, weights, box, bandwidth)
-    if float(tiling.left) > UNTILED * float(tiling.held @ weights / weights.sum()):
-        return None
-    number = int(tiling.real.sum())
-    kept = next(size for size in PROTOTYPES if size >= number)
-    fewer = Tiling(tiling.prototypes[:kept], tiling.real[:kept], tiling.held, tiling.left, tiling.objective)
-    return _divide(places, weights, box, bandwidth, fewer, allowed)
+    for most in PROTOTYPES:
+        tiling = _tile(places, weights, box, bandwidth, most=most)
+        if not bool(tiling.real[-1]):
+            return _divide(places, weights, box, bandwidth, tiling, allowed)
+    return None
 
 
 @record
@@ -95,26 +93,24 @@ class Tiling:
         prototypes: Their centers, the strongest seed's first.
         real: Which of them are.
         held: Support of each place.
-        left: Largest support that no prototype is near to.
         objective: Objective of the noise clustering.
     """
 
     prototypes: Float[Array, "C 2"]
     real: Bool[Array, " C"]
     held: Float[Array, " P"]
-    left: Float[Array, ""]
     objective: Float[Array, ""]
 
 
-@jax.jit
-def _tile(places: Array, weights: Array, box: Array, bandwidth: Array) -> Tiling:
+@partial(jax.jit, static_argnames="most")
+def _tile(places: Array, weights: Array, box: Array, bandwidth: Array, *, most: int) -> Tiling:
     """Noise clustering from mountain seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2)."""
     held, around = jnp.split(
         _supports(jnp.concatenate([places, _lattice(box, bandwidth)]), places, weights, bandwidth[None])[0],
         [len(places)],
     )
     least = (jnp.sqrt(jnp.median(around)) + SEED_SIGMAS / 2) ** 2
-    seeds, real, left = _mountains(places, held, weights, bandwidth, least)
+    seeds, real = _mountains(places, held, weights, bandwidth, least, most)
     delta = DELTA * bandwidth
 
     def update(prototypes: Array, _: None) -> tuple[Array, Array]:
@@ -126,7 +122,7 @@ def _tile(places: Array, weights: Array, box: Array, bandwidth: Array) -> Tiling
         return jnp.where(real[:, None] & (mass > 0), moved, prototypes), weights @ (1 / total[:, 0])
 
     prototypes, objectives = lax.scan(update, seeds, length=SWEEPS)
-    return Tiling(prototypes, real, held, left, objectives[-1])
+    return Tiling(prototypes, real, held, objectives[-1])
 
 
 @jax.jit
@@ -214,8 +210,8 @@ def _supports(
 
 
 def _mountains(
-    places: Array, held: Array, weights: Array, bandwidth: Array, least: Array
-) -> tuple[Array, Array, Array]:
+    places: Array, held: Array, weights: Array, bandwidth: Array, least: Array, most: int
+) -> tuple[Array, Array]:
     """Seeds by the mountain method (Yager and Filev 1994): the place of most support, all near it struck out, and so on."""
 
     def pick(index: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -225,10 +221,9 @@ def _mountains(
         near = ((places - places[best]) ** 2).sum(axis=1) < (APART * bandwidth) ** 2
         return jnp.where(near, -1.0, left), seeds.at[index].set(places[best]), real.at[index].set(good)
 
-    most = PROTOTYPES[-1]
     start = jnp.where(weights > 0, held, -1), jnp.zeros((most, 2), places.dtype), jnp.zeros(most, bool)
-    left, seeds, real = lax.fori_loop(0, most, pick, start)
-    return seeds, real, left.max()
+    _, seeds, real = lax.fori_loop(0, most, pick, start)
+    return seeds, real
 
 
 def _squared_distances(places: Array, prototypes: Array, scale: Array) -> Array:
