@@ -8,6 +8,7 @@ tied already this is the variety itself. Completing squares then gives center, r
 Whether a kind holds is judged in metres: by how far its ties move the surface, root mean square over the inliers.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -63,17 +64,18 @@ def recover(
     inliers = None if points is None else checks.points(points, dims=3)
     if inliers is not None and inliers.shape[0] != varieties.noise.shape[0]:
         raise ValueError(f"points must be the {varieties.noise.shape[0]} points of the fit, got {inliers.shape[0]}")
-    if kind == "quadric" or (is_concrete(varieties.centers) and not bool(holds(varieties, kind, variety=variety))):
+    if kind == "quadric":
         return _quadric(varieties, _index(varieties, variety))
-    if kind == "box":
-        return _box(varieties, inliers)[0]
-    return _shaped(varieties, kind, _index(varieties, variety), inliers)[0]
+    primitive, right = _found(varieties, _index(varieties, variety), inliers, kind=kind)
+    if is_concrete(right) and not bool(right):
+        return _quadric(varieties, _index(varieties, variety))
+    return primitive
 
 
 def holds(varieties: Varieties, kind: str, *, variety: int | None = None) -> Bool[Array, ""]:
     """Whether a variety is of a kind: imposing it moves the surface by no more than the inliers scatter about it.
 
-    A curved kind must also differ from a plane by more than that, or its radius means nothing.
+    A curved kind must also be told from a plane, which fits worse by five standard errors at least, or its radius means nothing.
 
     Args:
         varieties: What `nfcv` gave in one embedding.
@@ -86,13 +88,7 @@ def holds(varieties: Varieties, kind: str, *, variety: int | None = None) -> Boo
     _check(varieties, kind)
     if kind == "quadric":
         return jnp.asarray(True)
-    if kind == "box":
-        _, shift, scatter, sound = _box(varieties, None)
-    else:
-        at = _index(varieties, variety)
-        _, shift, scatter, sound = _shaped(varieties, kind, at, None)
-    rounding = 8 * jnp.sqrt(jnp.finfo(scatter.dtype).eps) * varieties.unit
-    return sound & (shift <= jnp.maximum(scatter, rounding))
+    return _found(varieties, _index(varieties, variety), None, kind=kind)[1]
 
 
 def _check(varieties: Varieties, kind: str) -> None:
@@ -111,6 +107,17 @@ def _check(varieties: Varieties, kind: str) -> None:
         raise ValueError(f"kind 'box' must have two or three varieties, one a face, got {count}")
     if varieties.basis.shape[-1] != varieties.centers.shape[-1] - 1:
         raise ValueError(f"varieties must be hyperplanes, got dimension {varieties.basis.shape[-1]}")
+
+
+@partial(jax.jit, static_argnames="kind")
+def _found(varieties: Varieties, at: Array, points: Array | None, *, kind: str) -> tuple[Primitive, Bool[Array, ""]]:
+    """The primitive of a kind and whether the kind holds."""
+    if kind == "box":
+        primitive, shift, scatter, sound = _box(varieties, points)
+    else:
+        primitive, shift, scatter, sound = _shaped(varieties, kind, at, points)
+    rounding = 8 * jnp.sqrt(jnp.finfo(scatter.dtype).eps) * varieties.unit
+    return primitive, sound & (shift <= jnp.maximum(scatter, rounding))
 
 
 def _index(varieties: Varieties, variety: int | None) -> Array:
@@ -211,9 +218,10 @@ def _shaped(varieties: Varieties, kind: str, at: Array, points: Array | None) ->
         primitive = _patch(on, normal, ends)
         return primitive, root(shift_square), root(free.square), jnp.asarray(True)
 
-    # A surface of huge radius is a plane: flattening it moves it by no more than the scatter about it.
+    # A surface of huge radius is a plane: only a plane that fits worse by five standard errors is told from it.
     flat = _tied(varieties, at, _linear(directions) @ unmixed(mixing).T)
-    curved = flat.square - free.square > jnp.maximum(free.square, 64 * jnp.finfo(dtype).eps * unit**2)
+    chance = 25 * divide(free.square, varieties.memberships[:, at].sum())
+    curved = flat.square - free.square > jnp.maximum(chance, 64 * jnp.finfo(dtype).eps * unit**2)
     curvature = tied.parts[0]
     center = -divide(linear, 2 * curvature)
     level = jnp.sum(center**2) - divide(tied.constant, curvature)
@@ -333,7 +341,7 @@ def _patch(on: Array, normal: Array, ends: _Ends) -> Plane:
     return Plane(corners.mean(axis=0), normal, corners)
 
 
-def _box(varieties: Varieties, points: Array | None) -> tuple[Box, Array, Array, Array]:
+def _box(varieties: Varieties, points: Array | None) -> tuple[Primitive, Array, Array, Array]:
     """The box of two or three faces, how far squaring its corners moves them, how far inliers scatter about them."""
     faces, centers = varieties.normals, varieties.centers
     third = normalised(jnp.cross(faces[0], faces[1]))
@@ -363,6 +371,7 @@ def _box(varieties: Varieties, points: Array | None) -> tuple[Box, Array, Array,
     return box, shift, jnp.sqrt(scatter.max()) * varieties.unit, jnp.all(size > 0)
 
 
+@jax.jit
 def _quadric(varieties: Varieties, at: Array) -> Quadric:
     """The variety as it is."""
     normal, center = varieties.normals[at], varieties.centers[at]
