@@ -78,8 +78,9 @@ def part(
         bandwidth: Bandwidth h of the support.
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
     """
+    held, background = _survey(places, weights, box, bandwidth)
     for most in PROTOTYPES:
-        tiling = _tile(places, weights, box, bandwidth, most=most)
+        tiling = _tile(places, weights, held, background, bandwidth, most=most)
         if not bool(tiling.real[-1]):
             return _divide(places, weights, box, bandwidth, tiling, allowed)
     return None
@@ -102,14 +103,18 @@ class Tiling:
     objective: Float[Array, ""]
 
 
+@jax.jit
+def _survey(places: Array, weights: Array, box: Array, bandwidth: Array) -> tuple[Array, Array]:
+    """Support of each place, and the background."""
+    queries = jnp.concatenate([places, _lattice(box, bandwidth)])
+    held, around = jnp.split(_supports(queries, places, weights, bandwidth[None])[0], [len(places)])
+    return held, jnp.median(around)
+
+
 @partial(jax.jit, static_argnames="most")
-def _tile(places: Array, weights: Array, box: Array, bandwidth: Array, *, most: int) -> Tiling:
+def _tile(places: Array, weights: Array, held: Array, background: Array, bandwidth: Array, *, most: int) -> Tiling:
     """Noise clustering from mountain seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2)."""
-    held, around = jnp.split(
-        _supports(jnp.concatenate([places, _lattice(box, bandwidth)]), places, weights, bandwidth[None])[0],
-        [len(places)],
-    )
-    least = (jnp.sqrt(jnp.median(around)) + SEED_SIGMAS / 2) ** 2
+    least = (jnp.sqrt(background) + SEED_SIGMAS / 2) ** 2
     seeds, real = _mountains(places, held, weights, bandwidth, least, most)
     delta = DELTA * bandwidth
 
