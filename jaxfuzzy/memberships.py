@@ -26,7 +26,7 @@ class Shares:
     """How n points divide themselves among K clusters and noise, before normalisation.
 
     Attributes:
-        log_parts: Logarithm of each cluster's part; -inf where it is zero.
+        log_parts: Logarithm of each cluster's part; far below the smallest float's where it is zero.
         log_noise: Logarithm of the noise cluster's part; -inf without one.
         log_total: Logarithm of the sum of all parts.
         nearest: The squared distance that the parts are relative to.
@@ -79,25 +79,32 @@ def shares(
         nearest = jnp.minimum(nearest, squared_noise)
     # Every expression below is the same for any reference, so the reference carries no derivative.
     nearest = lax.stop_gradient(nearest)
-    log_parts = r * _log_ratio(nearest, considered)
+    log_parts = _log_part(r, nearest, considered)
     if log_strengths is not None:
-        log_parts = log_parts + log_strengths[:, None]
+        real = log_strengths > -jnp.inf
+        weighed = log_parts + jnp.where(real, log_strengths, 0)[:, None]
+        log_parts = jnp.where(real[:, None], weighed, _nothing(nearest))
     total = jnp.exp(log_parts).sum(axis=0)
     log_noise = jnp.full_like(nearest, -jnp.inf)
     if squared_noise is not None:
-        log_noise = r * _log_ratio(nearest, jnp.broadcast_to(squared_noise, nearest.shape).astype(nearest.dtype))
+        log_noise = _log_part(r, nearest, jnp.broadcast_to(squared_noise, nearest.shape).astype(nearest.dtype))
         total = total + jnp.exp(log_noise)
     return Shares(log_parts, log_noise, jnp.log(total), nearest)
 
 
-def _log_ratio(nearest: Array, squared_distances: Array) -> Array:
-    """log(nearest / squared_distances): 0 where both are zero, -inf where only the first is, without a NaN derivative."""
+def _nothing(like: Array) -> Array:
+    """Logarithm of a part that is zero: finite, so that no derivative by m multiplies zero by infinity."""
+    return jnp.asarray(-(jnp.finfo(like.dtype).max ** 0.25), like.dtype)
+
+
+def _log_part(r: Scalar, nearest: Array, squared_distances: Array) -> Array:
+    """The part's logarithm r log(nearest / squared_distances): 0 where both are zero, that of nothing where only the first is."""
     on_it = squared_distances <= 0
     far = jnp.isinf(squared_distances) | (~on_it & (nearest <= 0))
     ratio = jnp.where(on_it | far, 1, nearest / jnp.where(on_it | far, 1, squared_distances))
     # A ratio below the smallest float is as good as never reached; flushed zeros must not meet the logarithm.
     far = far | (ratio <= 0)
-    return jnp.where(far, -jnp.inf, jnp.log(jnp.where(far, 1, ratio)))
+    return jnp.where(far, _nothing(nearest), r * jnp.log(jnp.where(far, 1, ratio)))
 
 
 def memberships(
