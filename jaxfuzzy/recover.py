@@ -45,8 +45,7 @@ def recover(
 
     Runs under `jit`, `vmap` and `grad`; derivatives reach back through `nfcv`. The axis of a cylinder or cone is y but for the
     embedding "9d", where it is free. Heights, corners and edges are where the inliers end along them; without the points
-    they are read from the inliers' bounds, which do as well for upright bodies but are some 10 % off for slanting edges and
-    30 % for a leaning axis.
+    they are read from the inliers' bounds, which do as well for upright bodies and are some 10 % off for slanting edges.
 
     Args:
         varieties: What `nfcv` gave in one embedding (`pick` one of several).
