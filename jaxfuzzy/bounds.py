@@ -11,6 +11,7 @@ import numpy as np
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.objects import Frame
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Sphere
+from jaxfuzzy.rays import CLOSED, OPEN
 
 PRICE = 0.35
 
@@ -37,7 +38,7 @@ def stretch(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def ends_of(
-    kind: str, theta: np.ndarray, hits: np.ndarray, part: np.ndarray, on: np.ndarray, signs: np.ndarray
+    kind: str, theta: np.ndarray, hits: np.ndarray, part: np.ndarray, on: np.ndarray, detail: np.ndarray
 ) -> np.ndarray:
     """Ends (low, high, error) (3, 3) of a surface in its own frame, unit free.
 
@@ -47,11 +48,18 @@ def ends_of(
         hits: Points moved onto it, in the frame in which its axis is y (N, 3).
         part: The part of the surface each belongs to.
         on: Which are inliers.
-        signs: Of the faces of a box.
+        detail: Signs of a box, ends of a body of revolution.
     """
     ends = np.zeros((3, 3))
     if kind in ("cylinder", "cone"):
-        ends[0] = stretch(hits[on, 1])
+        # A lid says where the side ends; how far down it goes, the side and the inner wall say.
+        side = on & (part != 1)
+        ends[0] = stretch(hits[side if side.sum() > 3 else on, 1])
+        if detail[0] == CLOSED:
+            ends[0, 1] = theta[4]
+            ends[0, 0] = min(ends[0, 0], theta[4])
+        if detail[0] == OPEN and (on & (part == 1)).any():
+            ends[0, 0] = min(ends[0, 0], theta[4])
         if kind == "cone" and theta[3] != 0:
             tip = theta[2] / theta[3]
             ends[0, :2] = np.minimum(ends[0, :2], tip) if theta[3] > 0 else np.maximum(ends[0, :2], tip)
@@ -60,8 +68,8 @@ def ends_of(
         across = np.stack([c * hits[:, 0] + s * hits[:, 2], c * hits[:, 2] - s * hits[:, 0], hits[:, 1]])
         for i in range(3):
             ends[i] = stretch(across[i][on & (part != i)])
-            if signs[i]:
-                ends[i, 1 if signs[i] > 0 else 0] = theta[1 + i]
+            if detail[i]:
+                ends[i, 1 if detail[i] > 0 else 0] = theta[1 + i]
     elif kind == "plane":
         first, second = _patch_axes(theta[:3])
         a, b = hits[on] @ first, hits[on] @ second

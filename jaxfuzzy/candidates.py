@@ -54,9 +54,12 @@ def planes_of(theta: Array) -> Candidates:
     return _flagged(theta, jnp.zeros((len(theta), 3), theta.dtype), (1, 1, 1, 1, 0, 0, 0))
 
 
-def spheres_of(theta: Array) -> Candidates:
-    """Spheres, which do not lean."""
-    return planes_of(theta)
+def spheres_of(theta: Array, rim: Array | None = None) -> Candidates:
+    """Spheres, which do not lean; bowls where a rim (H,) is given."""
+    whole = planes_of(theta)
+    if rim is None:
+        return whole
+    return whole._replace(detail=jnp.stack([rays.OPEN * jnp.ones_like(rim), rim, 0 * rim], -1))
 
 
 def sides_of(theta: Array, cone: bool) -> Candidates:
@@ -96,7 +99,7 @@ def meet(candidates: Candidates, counts: Counts, view: View, lids: bool) -> Meet
         rays.meet_plane(theta[p], seen[0]),
         rays.meet_box(theta[b], detail[b], seen[1]),
         rays.meet_revolution(theta[r], detail[r] if lids else None, seen[2]),
-        rays.meet_sphere(theta[s], seen[3]),
+        rays.meet_sphere(theta[s], detail[s] if lids else None, seen[3]),
     )
     return Meeting(*(jnp.concatenate(c) for c in zip(*each, strict=True)))
 

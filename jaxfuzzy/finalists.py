@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxfuzzy import rays, starts
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.candidates import Candidates, Counts, boxes_of, joined, vessels_of
+from jaxfuzzy.candidates import Candidates, Counts, boxes_of, joined, spheres_of, vessels_of
 from jaxfuzzy.rays import View
 from jaxfuzzy.screening import KEPT, SCREEN, absurd, best, price
 
@@ -48,13 +48,20 @@ def finalists(
     upright = coarse.take(plain)
     cut = np.cumsum((FINAL, FINAL + 1, 2 * FINAL))
     piece = lambda a, b: Candidates(*(c[a:b] for c in upright))
-    ended = (
-        []
-        if few.ray is None
-        else [_ended(coarse.theta[cylinders[0]], coarse.theta[cones[0]], few, window, height, lid)]
-    )
-    groups = [piece(0, cut[1]), boxes_of(tops[top], signs[top]), piece(cut[1], cut[2]), *ended, piece(cut[2], None)]
-    return joined(groups), Counts(FINAL, 2 * FINAL + 1, 2 * FINAL + sum(len(e.theta) for e in ended), FINAL)
+    ended, bowls = [], []
+    if few.ray is not None:
+        ended = [_ended(coarse.theta[cylinders[0]], coarse.theta[cones[0]], few, window, height, lid)]
+        bowls = [_bowls(upright.theta[cut[2]], few, window, height)]
+    groups = [
+        piece(0, cut[1]),
+        boxes_of(tops[top], signs[top]),
+        piece(cut[1], cut[2]),
+        *ended,
+        piece(cut[2], None),
+        *bowls,
+    ]
+    extra = lambda more: sum(len(m.theta) for m in more)
+    return joined(groups), Counts(FINAL, 2 * FINAL + 1, 2 * FINAL + extra(ended), FINAL + extra(bowls))
 
 
 def _ended(
@@ -62,13 +69,15 @@ def _ended(
 ) -> Candidates:
     """The best lid and the best open rim for the best sides, and a cylinder and a cone under the best lid."""
     floor = height.min()
-    # The cone that looks best from within.
-    within = window.cones[starts.ANCHORS :].at[:, 4].set(floor)
-    one = jnp.ones(len(within), few.gain.dtype)
-    looked = vessels_of(within, one * rays.OPEN, one * height.max(), one)
+    one = jnp.ones(len(window.cones) - starts.ANCHORS, few.gain.dtype)
+    # The cone and the cylinder that look best from within.
+    within = jnp.concatenate([window.cones[starts.ANCHORS :], window.cylinders[starts.ANCHORS :]]).at[:, 4].set(floor)
+    both = jnp.tile(one, 2)
+    looked = vessels_of(within, both * rays.OPEN, both * height.max(), both)
     cost = price(rays.meet_revolution(within, looked.detail, few), few) + absurd(within[:, 2])
-    sides = jnp.stack([cylinder, cone, within[jnp.argmin(cost)]])
-    steep = jnp.array([0.0, 1.0, 1.0], few.gain.dtype)
+    inner = [within[jnp.argmin(cost[: len(one)])], within[len(one) + jnp.argmin(cost[len(one) :])]]
+    sides = jnp.stack([cylinder, cone, *inner])
+    steep = jnp.array([0.0, 1.0, 1.0, 0.0], few.gain.dtype)
 
     # Each side with its rim at each height, with a lid and open.
     tried = jnp.tile(height, 2 * len(sides))
@@ -85,3 +94,14 @@ def _ended(
     cost = price(rays.meet_revolution(theta, lidded.detail, few), few, 2 * SCREEN) + absurd(theta[:, 2])
     pair = jnp.stack([jnp.argmin(jnp.where(kept, cost, jnp.inf)) for kept in (straight, ~straight)])
     return joined([rimmed, lidded.take(pair)])
+
+
+def _bowls(sphere: Array, few: View, window: starts.Windows, height: Array) -> Candidates:
+    """The best rim for the best sphere and for the one that looks best from within."""
+    within = window.spheres[starts.ANCHORS :]
+    looked = spheres_of(within, jnp.full(len(within), height.max()))
+    cost = price(rays.meet_sphere(within, looked.detail, few), few) + absurd(within[:, 3])
+    both = jnp.stack([sphere, within[jnp.argmin(cost)]])
+    rimmed = spheres_of(jnp.repeat(both, len(height), axis=0), jnp.tile(height, 2))
+    cost = price(rays.meet_sphere(rimmed.theta, rimmed.detail, few), few).reshape(2, -1)
+    return rimmed.take(jnp.argmin(cost, -1) + jnp.arange(2) * len(height))

@@ -105,7 +105,7 @@ def polish(
             lambda t: rays.meet_plane(t, seen),
             lambda t: rays.meet_box(t, detail, seen),
             lambda t: rays.meet_revolution(t, ends, seen),
-            lambda t: rays.meet_sphere(t, seen),
+            lambda t: rays.meet_sphere(t, ends, seen),
         )
         return lax.switch(family, families, theta[None])
 

@@ -122,8 +122,15 @@ def plane(theta: Array, view: View, met: Meeting) -> Residual:
     return _residual(view, met, direction, hit, normal, (*(c * scale for c in hit), -scale, 0.0), 1.0)
 
 
-def meet_sphere(theta: Array, view: View) -> Meeting:
-    """Sphere, theta (H, 5) = (center, radius, unused)."""
+def meet_sphere(theta: Array, detail: Array | None, view: View) -> Meeting:
+    """Sphere, theta (H, 5) = (center, radius, unused).
+
+    Args:
+        theta: Parameters.
+        detail: None for a whole sphere, else (H, 3): kind of end (`SIDE` or, a bowl seen from above, `OPEN`), height of the
+            rim, unused.
+        view: The points.
+    """
     radius = jnp.abs(theta[:, 3, None]) + 1e-4
     away = tuple(p - theta[:, i, None] for i, p in enumerate(columns(view.point)))
     square = _dot(away, away)
@@ -132,11 +139,19 @@ def meet_sphere(theta: Array, view: View) -> Meeting:
     half, constant = _dot(away, columns(view.ray)), square - radius**2
     inside = half**2 - constant
     root = jnp.sqrt(jnp.maximum(inside, 0.0) + TINY)
-    return _meeting(_nearer(1.0, half, constant, inside, root), jnp.maximum(-inside, 0.0) / (2 * radius))
+    depth, miss = _nearer(1.0, half, constant, inside, root), jnp.maximum(-inside, 0.0) / (2 * radius)
+    if detail is None:
+        return _meeting(depth, miss)
+    y, v = view.point[:, 1], view.ray[:, 1]
+    back = (y + depth * v > detail[:, 1, None]) & (detail[:, :1] == OPEN)
+    depth = jnp.where(back, _farther(1.0, half, constant, root), depth)
+    miss = jnp.where(back, miss + jnp.maximum(y + depth * v - detail[:, 1, None], 0.0), miss)
+    return Meeting(depth, miss, jnp.where(back, 2, 0))
 
 
 def sphere(theta: Array, view: View, met: Meeting) -> Residual:
-    """Residuals of spheres."""
+    """Residuals of spheres; parts are 0 for the outside, 2 for the inside of a bowl."""
+    inner = jnp.where(met.part == 2, -1.0, 1.0)
     radius = jnp.abs(theta[:, 3, None]) + 1e-4
     direction: tuple[Array, ...]
     if view.ray is not None:
@@ -145,8 +160,8 @@ def sphere(theta: Array, view: View, met: Meeting) -> Residual:
         away = tuple(p - theta[:, i, None] for i, p in enumerate(columns(view.point)))
         direction = tuple(-c * lax.rsqrt(_dot(away, away) + TINY) for c in away)
     hit = _along(columns(view.point), direction, met.depth)
-    normal = tuple(h - theta[:, i, None] for i, h in enumerate(hit))
-    return _residual(view, met, direction, hit, normal, (*(-c for c in normal), -radius, 0.0), radius)
+    normal = tuple((h - theta[:, i, None]) * inner for i, h in enumerate(hit))
+    return _residual(view, met, direction, hit, normal, (*(-c for c in normal), -radius * inner, 0.0), radius)
 
 
 def meet_revolution(theta: Array, detail: Array | None, view: View) -> Meeting:
@@ -294,9 +309,9 @@ def _nearer(square: Array | float, half: Array, constant: Array, inside: Array, 
     return jnp.where(inside < 0, -half / safe, enter)
 
 
-def _farther(square: Array, half: Array, constant: Array, root: Array) -> Array:
+def _farther(square: Array | float, half: Array, constant: Array, root: Array) -> Array:
     """Where a ray leaves it."""
-    safe = jnp.where(jnp.abs(square) < 1e-3, 1e-3, square)
+    safe = square if isinstance(square, float) else jnp.where(jnp.abs(square) < 1e-3, 1e-3, square)
     return jnp.where(half > 0, -constant / (half + root), (root - half) / safe)
 
 

@@ -39,7 +39,7 @@ def screened(few: View, window: starts.Windows, company: Array) -> tuple[Candida
     n = len(window.cylinders) + len(line_cylinders)
     cylinders, cones = bodies[best(cost[:n], KEPT)], bodies[n + best(cost[n:], KEPT)]
     cones = jnp.concatenate([cones, *(cylinders[:SLOPED].at[:, 3].set(s) for s in SLOPES)])
-    cost = price(rays.meet_sphere(window.spheres, few), few) + absurd(window.spheres[:, 3])
+    cost = price(rays.meet_sphere(window.spheres, None, few), few) + absurd(window.spheres[:, 3])
     spheres = window.spheres[best(cost, KEPT)]
     cost = price(rays.meet_plane(window.planes, few), few)
     planes = window.planes[best(cost, KEPT)]
