@@ -19,7 +19,7 @@ FEWEST = 12
 # Noise of a surface over that of small windows from which on it is refused; and from which on it is where many points lie
 # just off it, between one and 2.4 noise distances, and the noise is more than real boxes and tins bulge and dent, as a share
 # of the object's spread. Measured on simulated clouds of 0.5 to 3 mm noise: right ones stay below 1.25.
-MISFIT, SUSPECT, NEAR, BULGE = 1.9, 1.35, 0.06, 0.044
+MISFIT, SUSPECT, NEAR, BULGE = 1.9, 1.35, 0.06, 0.055
 # Noise over spread of the points from which on there is no surface to speak of.
 HOPELESS = 0.35
 # Least share of an object's points that must lie on its surface.
@@ -80,14 +80,17 @@ def look_at(items: Sequence[Prepared], settings: Settings) -> list[Look]:
     """Searches all objects, again where that promises more."""
     looks = _search(items, settings)
     first = list(looks)
+    unsure = [i for i, item in enumerate(items) if not item.given]
     # A wrong first guess of the noise blurs the search or blinds it: look again with what was found.
     for _ in range(MOST_LOOKS - 1):
-        ratio = [o.noise / (o.fitted.deviation * np.median(1 / o.item.gain)) for o in looks]
-        again = [i for i, r in enumerate(ratio) if not items[i].given and not OVERRATED <= r <= UNDERRATED]
-        sharper = _search([_with_noise_found(looks[i]) for i in again], settings, [first[i].expected for i in again])
-        for i, new in zip(again, sharper, strict=True):
-            if ratio[i] < OVERRATED or new.score < looks[i].score:
+        unsure = [i for i in unsure if not OVERRATED <= looks[i].fitted.polished.scale <= UNDERRATED]
+        sharper = _search([_with_noise_found(looks[i]) for i in unsure], settings, [first[i].expected for i in unsure])
+        better = []
+        for i, new in zip(unsure, sharper, strict=True):
+            if looks[i].fitted.polished.scale < OVERRATED or new.score < looks[i].score:
                 looks[i] = new
+                better.append(i)
+        unsure = better
     refused = [i for i, o in enumerate(looks) if o.reason]
     turned = [(i, item) for i in refused for item in _turned(looks[i], settings.camera, settings.along_ray)]
     others = _search([item for _, item in turned], settings, [looks[i].expected for i, _ in turned])

@@ -146,7 +146,7 @@ def meet_sphere(theta: Array, detail: Array | None, view: View) -> Meeting:
     back = (y + depth * v > detail[:, 1, None]) & (detail[:, :1] == OPEN)
     depth = jnp.where(back, _farther(1.0, half, constant, root), depth)
     miss = jnp.where(back, miss + jnp.maximum(y + depth * v - detail[:, 1, None], 0.0), miss)
-    return Meeting(depth, miss, jnp.where(back, 2, 0))
+    return Meeting(depth, miss, jnp.where(back, 2, 0).astype(jnp.int32))
 
 
 def sphere(theta: Array, view: View, met: Meeting) -> Residual:
@@ -206,7 +206,7 @@ def meet_revolution(theta: Array, detail: Array | None, view: View) -> Meeting:
     outside = jnp.sqrt((dx + drop * u) ** 2 + (dz + drop * w) ** 2) - (r0 - narrowing * level)
     miss = jnp.where(flat, jnp.maximum(outside, 0.0) * down + jnp.maximum(v, 0.0), miss)
     miss = jnp.where(back & ~flat, miss + jnp.maximum(height - top, 0.0), miss)
-    return _meeting(jnp.where(flat, drop, depth), miss, jnp.where(flat, 1, jnp.where(back, 2, 0)))
+    return _meeting(jnp.where(flat, drop, depth), miss, jnp.where(flat, 1, jnp.where(back, 2, 0)).astype(jnp.int32))
 
 
 def revolution(theta: Array, view: View, met: Meeting) -> Residual:
