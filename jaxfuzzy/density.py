@@ -8,6 +8,8 @@ them belong together unless the support of the plane has a valley between them. 
 a count of points, so that a valley can be told from chance: the square root of a Poisson count has the same spread everywhere.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,22 +18,23 @@ from jax import lax
 from jaxfuzzy.arrays import Array, Bool, Float, Int, record
 
 # Small clusters that tile the objects (the sizes compiled); neighbours each is compared with, at so many places on the way.
-PROTOTYPES, NEIGHBOURS, STOPS = (32, 64, 128), 6, 5
+PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
 SWEEPS = 10
 # Bandwidths that the number of groups is looked for at: two ladders of a factor 2 in h², interleaved, over the first one's base.
 LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
 BASE = 2
 # Lengths in bandwidths: distance between seeds, noise distance, farthest neighbour, margin of the box that background is sought in.
 APART, DELTA, REACH, MARGIN = 2.0, 2.4, 7.2, 4.0
-# Support below which no seed is put, and the lattice on which the background is measured.
-LEAST, LATTICE = 3.0, 16
+# A seed stands so many standard deviations of a count above the background, which is the median over a lattice.
+SEED_SIGMAS, LATTICE = 3.0, 16
 # A peak is an object's when the valley beside it falls below this share of it, by so many standard deviations of a count ...
 VALLEY, VALLEY_SIGMAS = 0.6, 4.0
 # ... and it stands so many above the background.
 PEAK_SIGMAS = 6.0
-# An outlier's support is below this share of its object's mean, and not so many deviations above the background.
-SPARSE, SPARSE_SIGMAS = 0.2, 4.0
-BLOCK = 512
+# An outlier's support is below this share of its object's mean, and not so many deviations above the background; a point
+# counts in its own support, so that above no background one alone is an outlier and one with a neighbour is none.
+SPARSE, SPARSE_SIGMAS = 0.2, 2.2
+BLOCK = 64
 
 
 @record
@@ -41,7 +44,8 @@ class Groups:
     Attributes:
         prototypes: Centers of the small clusters.
         group: Rank of the group that each prototype belongs to, -1 for none.
-        found: Number of groups that the tests tell apart.
+        counts: Number of groups that the tests tell apart, at each bandwidth of the ladder.
+        found: The one of these that stays longest.
         count: Number of groups kept.
         shares: Each place's membership in the groups, -1's share left out.
         typicality: Support of each place over the least that its group asks for; below 1 it is an outlier.
@@ -50,6 +54,7 @@ class Groups:
 
     prototypes: Float[Array, "C 2"]
     group: Int[Array, " C"]
+    counts: Int[Array, " L"]
     found: Int[Array, ""]
     count: Int[Array, ""]
     shares: Float[Array, "P G"]
@@ -60,22 +65,25 @@ class Groups:
 def part(
     places: Float[Array, "P 2"],
     weights: Float[Array, " P"],
+    box: Float[Array, "2 2"],
     bandwidth: Float[Array, ""],
     allowed: Bool[Array, " G"],
-) -> Groups:
-    """Parts the places of a plane into groups.
+) -> Groups | None:
+    """Parts the places of a plane into groups; None where the prototypes do not suffice to tile it at this bandwidth.
 
     Args:
         places: Places; padded ones have weight 0.
         weights: Number of points at each place.
+        box: Lower and upper corner of the box that holds nearly all of them.
         bandwidth: Bandwidth h of the support.
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
     """
-    tiling = _tile(places, weights, bandwidth)
-    number = int(tiling.real.sum())
-    kept = next(size for size in PROTOTYPES if size >= number)
-    tiling = Tiling(tiling.prototypes[:kept], tiling.real[:kept], tiling.held, tiling.objective)
-    return _divide(places, weights, bandwidth, tiling, allowed)
+    held, background = _survey(places, weights, box, bandwidth)
+    for most in PROTOTYPES:
+        tiling = _tile(places, weights, held, background, bandwidth, most=most)
+        if not bool(tiling.real[-1]):
+            return _divide(places, weights, box, bandwidth, tiling, allowed)
+    return None
 
 
 @record
@@ -96,10 +104,18 @@ class Tiling:
 
 
 @jax.jit
-def _tile(places: Array, weights: Array, bandwidth: Array) -> Tiling:
+def _survey(places: Array, weights: Array, box: Array, bandwidth: Array) -> tuple[Array, Array]:
+    """Support of each place, and the background."""
+    queries = jnp.concatenate([places, _lattice(box, bandwidth)])
+    held, around = jnp.split(_supports(queries, places, weights, bandwidth[None])[0], [len(places)])
+    return held, jnp.median(around)
+
+
+@partial(jax.jit, static_argnames="most")
+def _tile(places: Array, weights: Array, held: Array, background: Array, bandwidth: Array, *, most: int) -> Tiling:
     """Noise clustering from mountain seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2)."""
-    held = _supports(places, places, weights, bandwidth[None])[0]
-    seeds, real = _mountains(places, held, weights, bandwidth)
+    least = (jnp.sqrt(background) + SEED_SIGMAS / 2) ** 2
+    seeds, real = _mountains(places, held, weights, bandwidth, least, most)
     delta = DELTA * bandwidth
 
     def update(prototypes: Array, _: None) -> tuple[Array, Array]:
@@ -115,10 +131,10 @@ def _tile(places: Array, weights: Array, bandwidth: Array) -> Tiling:
 
 
 @jax.jit
-def _divide(places: Array, weights: Array, bandwidth: Array, tiling: Tiling, allowed: Array) -> Groups:
+def _divide(places: Array, weights: Array, box: Array, bandwidth: Array, tiling: Tiling, allowed: Array) -> Groups:
     prototypes, real, most = tiling.prototypes, tiling.real, len(allowed)
     one, other, near = _neighbours(prototypes, real, bandwidth)
-    peaks, saddles, backgrounds = _landscape(prototypes, one, other, places, weights, bandwidth)
+    peaks, saddles, backgrounds = _landscape(prototypes, one, other, places, weights, box, bandwidth)
     peaks = jnp.where(real, peaks, 0)
     saddles = jnp.where(near, jnp.minimum(saddles, jnp.minimum(peaks[:, one], peaks[:, other])), -1)
     orders = jnp.argsort(-saddles, axis=1, stable=True)
@@ -131,7 +147,7 @@ def _divide(places: Array, weights: Array, bandwidth: Array, tiling: Tiling, all
     # The nearest number that is allowed, the lower of two.
     numbers = jnp.arange(1, most + 1)
     wanted = numbers[jnp.argmin(jnp.where(allowed, jnp.abs(numbers - counts[level]), jnp.inf))]
-    kept = (_rank(-prominence) < wanted) & (prominence > 0)
+    kept = (_rank(-prominence) < wanted) & real
     root = _join(one[order], other[order], near[order], peak, kept | (valley >= 1))
     # Objects in the order of their peaks, the strongest first.
     group = jnp.where(kept[root] & real, _rank(jnp.where(kept, -peak, jnp.inf))[root], -1)
@@ -144,11 +160,14 @@ def _divide(places: Array, weights: Array, bandwidth: Array, tiling: Tiling, all
     chance = (jnp.sqrt(backgrounds[BASE]) + SPARSE_SIGMAS / 2) ** 2
     least = jnp.minimum(SPARSE * usual[jnp.argmax(shares, axis=1)], chance)
     typicality = tiling.held / jnp.maximum(least, jnp.finfo(places.dtype).tiny)
-    return Groups(prototypes, group, counts[level], kept.sum(), shares, typicality, tiling.objective)
+    return Groups(prototypes, group, counts, counts[level], kept.sum(), shares, typicality, tiling.objective)
 
 
 def _rank(values: Array) -> Array:
-    return jnp.argsort(jnp.argsort(values, stable=True), stable=True)
+    """How many values come before each; the first of equal ones first."""
+    index = jnp.arange(len(values))
+    before = (values < values[:, None]) | ((values == values[:, None]) & (index < index[:, None]))
+    return before.sum(axis=1)
 
 
 def _steadiest(counts: Int[Array, " L"]) -> Int[Array, ""]:
@@ -195,22 +214,20 @@ def _supports(
     return lax.scan(add, jnp.zeros((levels, len(queries)), places.dtype), blocks)[0]
 
 
-def _mountains(places: Array, held: Array, weights: Array, bandwidth: Array) -> tuple[Array, Array]:
+def _mountains(
+    places: Array, held: Array, weights: Array, bandwidth: Array, least: Array, most: int
+) -> tuple[Array, Array]:
     """Seeds by the mountain method (Yager and Filev 1994): the place of most support, all near it struck out, and so on."""
 
     def pick(index: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         left, seeds, real = state
         best = jnp.argmax(left)
-        good = (left[best] > LEAST) | (index == 0)
+        good = (left[best] > least) | (index == 0)
         near = ((places - places[best]) ** 2).sum(axis=1) < (APART * bandwidth) ** 2
         return jnp.where(near, -1.0, left), seeds.at[index].set(places[best]), real.at[index].set(good)
 
-    start = (
-        jnp.where(weights > 0, held, -1),
-        jnp.zeros((PROTOTYPES[-1], 2), places.dtype),
-        jnp.zeros(PROTOTYPES[-1], bool),
-    )
-    _, seeds, real = lax.fori_loop(0, PROTOTYPES[-1], pick, start)
+    start = jnp.where(weights > 0, held, -1), jnp.zeros((most, 2), places.dtype), jnp.zeros(most, bool)
+    _, seeds, real = lax.fori_loop(0, most, pick, start)
     return seeds, real
 
 
@@ -220,37 +237,33 @@ def _squared_distances(places: Array, prototypes: Array, scale: Array) -> Array:
 
 
 def _neighbours(prototypes: Array, real: Array, bandwidth: Array) -> tuple[Array, Array, Array]:
-    """Pairs of prototypes that stand near each other: the one, the other, and whether they are near at all."""
+    """Each prototype with the nearest of those stronger than itself: the one, the other, and whether they are near at all."""
     gap = jnp.sqrt(((prototypes[:, None] - prototypes) ** 2).sum(axis=-1))
-    gap = jnp.where(jnp.eye(len(real), dtype=bool) | ~(real[:, None] & real), jnp.inf, gap)
+    index = jnp.arange(len(real))
+    gap = jnp.where((index < index[:, None]) & real[:, None] & real, gap, jnp.inf)
     length, other = lax.top_k(-gap, NEIGHBOURS)
     one = jnp.repeat(jnp.arange(len(real)), NEIGHBOURS)
     return one, other.ravel(), -length.ravel() < REACH * bandwidth
 
 
 def _landscape(
-    prototypes: Array, one: Array, other: Array, places: Array, weights: Array, bandwidth: Array
+    prototypes: Array, one: Array, other: Array, places: Array, weights: Array, box: Array, bandwidth: Array
 ) -> tuple[Array, Array, Array]:
     """At each bandwidth of the ladder: support at the prototypes, the least on the way between neighbours, the background."""
     stops = ((jnp.arange(STOPS) + 1) / (STOPS + 1)).astype(places.dtype)[:, None]
     way = prototypes[one][:, None] * (1 - stops) + prototypes[other][:, None] * stops
-    low, high = _box(places, weights)
-    low, high = low - MARGIN * bandwidth, high + MARGIN * bandwidth
-    step = (jnp.arange(LATTICE) + 0.5) / LATTICE
-    lattice = low + (high - low) * jnp.stack(jnp.meshgrid(step, step), axis=-1).reshape(-1, 2).astype(places.dtype)
+    lattice = _lattice(box, bandwidth)
     queries = jnp.concatenate([prototypes, way.reshape(-1, 2), lattice])
     held = _supports(queries, places, weights, bandwidth * jnp.asarray(LADDER, places.dtype))
     peaks, on_way, around = jnp.split(held, [len(prototypes), len(queries) - len(lattice)], axis=1)
     return peaks, on_way.reshape(len(LADDER), -1, STOPS).min(axis=-1), jnp.median(around, axis=1)
 
 
-def _box(places: Array, weights: Array) -> tuple[Array, Array]:
-    """The box that holds all but a hundredth of the weight at each side."""
-    order = jnp.argsort(places, axis=0)
-    passed = jnp.cumsum(weights[order], axis=0) / weights.sum()
-    first, last = (passed < 0.01).sum(axis=0), (passed < 0.99).sum(axis=0)
-    sides = jnp.arange(2)
-    return places[order[first, sides], sides], places[order[jnp.minimum(last, len(places) - 1), sides], sides]
+def _lattice(box: Float[Array, "2 2"], bandwidth: Array) -> Array:
+    """Where the background is looked at."""
+    low, high = box[0] - MARGIN * bandwidth, box[1] + MARGIN * bandwidth
+    step = ((jnp.arange(LATTICE) + 0.5) / LATTICE).astype(box.dtype)
+    return low + (high - low) * jnp.stack(jnp.meshgrid(step, step), axis=-1).reshape(-1, 2)
 
 
 def _prominences(

@@ -27,8 +27,8 @@ from jaxfuzzy.status import Status
 SLAB = 1.3
 # Points nearer to a plane than so many standard deviations are not told from it.
 ABOVE = 3.0
-# A wall has at most this share of the points behind it, and spans at least that share of the view.
-BEHIND, SPAN = 0.05, 0.4
+# A wall has at most this share of the points behind it, at least that share before it, and spans at least that much of the view.
+BEHIND, AHEAD, SPAN = 0.1, 0.01, 0.4
 MOST_WALLS = 4
 # A supporting plane must hold this share of the view, net of what is seen below it.
 LEAST_SUPPORT = 0.004
@@ -126,9 +126,7 @@ def fit_ground(
     w = np.ones(len(x), dtype) if mass is None else np.asarray(mass, dtype)
     axis = checks.direction(up, "up")
     checks.number(max_tilt, "max_tilt", above=0.0)
-    eye = (
-        None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), x.dtype)[0]
-    )
+    eye = None if camera is None else checks.position(camera, "camera").astype(x.dtype)
     std, known = _deviation(x, w, noise_distance, depth_std, eye)
     ray, floor = noise_of(x, std, eye if isinstance(noise_distance, str) else None)
     view = view_of(x, w, ray, floor, axis, eye)
@@ -178,9 +176,7 @@ def foreground(
     x = np.asarray(cloud)
     mass = checks.weights(weights, len(x))
     kept = np.ones(len(x), bool) if mass is None else np.asarray(mass) > 0
-    eye = (
-        None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), x.dtype)[0]
-    )
+    eye = None if camera is None else checks.position(camera, "camera").astype(x.dtype)
     std, known = _deviation(x, kept, "auto", ground.depth_std, eye)
     ray, floor = noise_of(x, std, eye)
     cut, table = jnp.zeros((), cloud.dtype), np.asarray(ground.inliers)
@@ -206,7 +202,7 @@ def foreground(
         ends_view = (behind & standing).sum() <= BEHIND * standing.sum() and (
             behind & table
         ).sum() <= BEHIND * table.sum()
-        if not ends_view or ahead.sum() < BEHIND * standing.sum() or _span(x, standing, on, axis, eye) < SPAN:
+        if not ends_view or ahead.sum() < AHEAD * standing.sum() or _span(x, standing, on, axis, eye) < SPAN:
             break
         walls.append(_rectangle(x[on], normal, offset))
         standing &= residual >= -ABOVE

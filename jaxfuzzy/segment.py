@@ -1,6 +1,7 @@
 """From points to objects: how many stand on the ground plane, and which point belongs to which."""
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, record
-from jaxfuzzy.density import DELTA, part
+from jaxfuzzy.density import DELTA, PROTOTYPES, SWEEPS, part
 from jaxfuzzy.fcm import Partition, fcm
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.seeding import Seeds, histogram_seeds
@@ -18,11 +19,15 @@ from jaxfuzzy.validity import ClusterCount, choose_k
 # "auto" allows so many objects.
 MOST = 20
 # Bandwidth over (spacing² · size)^(1/3), spacing that of the points on their surface, size that of the surface.
-BANDWIDTH = 2.05
-# Points beyond this number are gathered in cells of a third of the bandwidth; the sizes that are compiled.
-CAPACITIES = (256, 512, 1024, 2048, 4096)
+BANDWIDTH = 1.95
+# Points are gathered in cells of a third of the bandwidth; numbers of cells that are compiled.
+CAPACITIES = (1024, 2048, 4096)
+# A cloud counts for no more points than this: of a dense one, neighbours are not independent.
+COUNTED = 4096
+# A scene too wide for its detail is looked at with a wider bandwidth, one with too few peaks with a narrower one; so many times.
+COARSER, ATTEMPTS = 1.25, 24
 # The spacing is measured at so many points, among so many, by the distance to this neighbour; a low quantile leaves outliers out.
-PROBES, CROWD, NEIGHBOUR, QUANTILE, ALONE = 192, 4096, 8, 0.2, 2.5
+PROBES, CROWD, NEIGHBOUR, QUANTILE, ALONE = 192, 3072, 8, 0.2, 2.5
 
 
 @record
@@ -108,31 +113,84 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
     flat = (x - np.average(x, axis=0, weights=w)) @ axes.T
     turn = np.linalg.eigh((flat * w[:, None]).T @ flat)[1]
     flat = flat @ turn
-    places, weight, cell = _places(flat, w, bandwidth)
-    allowed = np.isin(np.arange(1, candidates[-1] + 1), candidates)
-    groups = part(
-        jnp.asarray(places, x.dtype),
-        jnp.asarray(weight, x.dtype),
-        jnp.asarray(bandwidth, x.dtype),
-        jnp.asarray(allowed),
-    )
-    k = int(groups.count)
-    shares = np.asarray(groups.shares)[cell, :k]
-    # Noise takes as much of a point as its best object does where its support is just enough, and more with less support.
-    typicality = np.asarray(groups.typicality)[cell]
+    able = [k for k in candidates if k <= PROTOTYPES[-1]]
+    if not able:
+        raise ValueError(f"ks must hold a number of at most {PROTOTYPES[-1]} for rule='robust', got {candidates}")
+    length = MOST if able[-1] <= MOST else PROTOTYPES[-1]
+    allowed = jnp.asarray(np.isin(np.arange(1, length + 1), able))
+    box = jnp.asarray(np.quantile(flat[w > 0], [0.01, 0.99], axis=0), x.dtype)
+    for _ in range(ATTEMPTS):
+        places, weight, cell = _places(flat, w, bandwidth)
+        groups = part(
+            jnp.asarray(places, x.dtype),
+            jnp.asarray(weight, x.dtype),
+            box,
+            jnp.asarray(bandwidth, x.dtype),
+            allowed,
+        )
+        if groups is not None and int(groups.count) >= able[0]:
+            break
+        # Too wide a scene for its detail, or too few peaks to choose from.
+        bandwidth *= COARSER if groups is None else 1 / COARSER
+    if groups is None:
+        raise checks.DataError(
+            "the points are too scattered to be divided: remove outliers, or give a larger noise_distance"
+        )
+    k, number = int(groups.count), int(cell.max()) + 1
+    shares, typicality = np.asarray(groups.shares)[:number, :k], np.asarray(groups.typicality)[:number]
+    # Noise takes as much of a place as its best object does where its support is just enough, and more with less support;
+    # and all that belongs to groups that are no objects.
     best = shares.max(axis=1)
     total = typicality + best
-    u, noise_share = shares * (typicality / total)[:, None], best / total
-    # What is left belongs to groups that are no objects.
-    noise_share = noise_share + (1 - shares.sum(axis=1)) * typicality / total
-    labels = np.where(noise_share > u.max(axis=1), -1, u.argmax(axis=1)).astype(np.int32)
+    u = shares * (typicality / total)[:, None]
+    lost = best / total + (1 - shares.sum(axis=1)) * typicality / total
+    labels = np.where(lost > u.max(axis=1), -1, u.argmax(axis=1)).astype(np.int32)
     status = Status.AT_BOUND if int(groups.found) >= candidates[-1] else Status(0)
     if not (labels >= 0).any():
         status |= Status.ALL_NOISE
-    partition = _partition(x, w, axes, u, noise_share, labels, float(groups.objective), DELTA * bandwidth, int(status))
-    return Segmentation(
-        partition.labels, k, partition.sizes, _shares(labels, w, k, x.dtype), partition, None, None, partition.status
+    if k not in able:
+        status |= Status.TOO_FEW_POINTS
+    centers, sizes = _sizes(x, w, flat, u, cell)
+    partition = Partition(
+        centers=jnp.asarray(centers, x.dtype),
+        sizes=jnp.asarray(sizes, x.dtype),
+        memberships=jnp.asarray(u[cell]),
+        noise=jnp.asarray(lost[cell]),
+        labels=jnp.asarray(labels[cell]),
+        objective=groups.objective,
+        steps=jnp.asarray(SWEEPS),
+        status=jnp.asarray(int(status), jnp.int32),
+        m=2.0,
+        noise_distance=DELTA * bandwidth,
     )
+    return Segmentation(
+        partition.labels,
+        k,
+        partition.sizes,
+        _shares(labels[cell], w, k, x.dtype),
+        partition,
+        None,
+        None,
+        partition.status,
+    )
+
+
+def _sizes(
+    x: np.ndarray, w: np.ndarray, flat: np.ndarray, u: np.ndarray, cell: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centers (eq. 10) and sizes (eq. 11, m = 2: alpha goes with the root of the sum of u² D) of memberships given a cell."""
+    total = partial(np.bincount, cell, minlength=len(u))
+    mass = total(w)
+    held = np.maximum(mass, np.finfo(float).tiny)
+    mean = np.stack([total(w * x[:, i]) for i in range(3)], axis=1) / held[:, None]
+    middle = np.stack([total(w * flat[:, i]) for i in (0, 1)], axis=1) / held[:, None]
+    within = total(w * ((flat - middle[cell]) ** 2).sum(axis=1))
+    square = u.astype(float) ** 2
+    pull = mass[:, None] * square
+    share = pull / np.maximum(pull.sum(axis=0), np.finfo(float).tiny)
+    squared = ((middle[:, None] - share.T @ middle) ** 2).sum(axis=-1)
+    sizes = np.sqrt((pull * squared).sum(axis=0) + square.T @ within)
+    return share.T @ mean, sizes / sizes.sum() if sizes.sum() > 0 else np.full(len(sizes), 1 / len(sizes))
 
 
 def _paper(x: np.ndarray, w: np.ndarray, flat: np.ndarray, candidates: tuple[int, ...]) -> Segmentation:
@@ -155,11 +213,13 @@ def _paper(x: np.ndarray, w: np.ndarray, flat: np.ndarray, candidates: tuple[int
 def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     """From the spacing of the points on their surface and the size of that surface; what lies alone counts as neither."""
     real = np.flatnonzero(w > 0)
-    crowd = x[real[np.linspace(0, len(real) - 1, min(len(real), CROWD)).astype(int)]].astype(float)
+    crowd = x[real[:: max(len(real) // (16 * CROWD), 1)]].astype(float)
+    crowd = crowd - crowd.mean(axis=0)
+    # Thinned in an order of the points' own, so that the one they come in does not matter.
+    crowd = crowd[np.argsort((crowd**2).sum(axis=1), kind="stable")]
+    crowd = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), CROWD)).astype(int)]
     probes = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), PROBES)).astype(int)]
     neighbour = min(NEIGHBOUR, len(crowd) - 1)
-    offset = crowd.mean(axis=0)
-    crowd, probes = crowd - offset, probes - offset
     square = (probes**2).sum(axis=1)[:, None] + (crowd**2).sum(axis=1) - 2 * probes @ crowd.T
     reach = np.sqrt(np.maximum(np.partition(square, neighbour, axis=1)[:, neighbour], 0))
     usual = np.quantile(reach, QUANTILE)
@@ -174,7 +234,7 @@ def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarr
     """The points as few enough weighted places, padded; and the place of each point."""
     most = CAPACITIES[-1]
     real = np.flatnonzero(w > 0)
-    pitch = bandwidth / 3
+    pitch = bandwidth / 2
     while True:
         corner = np.floor(np.clip(flat / pitch, -1e9, 1e9)).astype(np.int64)
         key = (corner[:, 0] - corner[:, 0].min()) * (np.ptp(corner[:, 1]) + 1) + corner[:, 1] - corner[:, 1].min()
@@ -183,8 +243,8 @@ def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarr
             break
         pitch *= 1.25
     number = int(cell.max()) + 1
-    # A point counts as one on the average, and a cloud for no more points than there are places: neighbouring pixels err alike.
-    scale = min(len(real), most) / w.sum()
+    # A point counts as one on the average, and a dense cloud for fewer points than it has.
+    scale = min(len(real), COUNTED) / w.sum()
     weight = np.bincount(cell, w, minlength=number)
     # Points of weight 0 get a label too; alone in their cell, they are where they are.
     share = np.where(weight[cell] > 0, w, 1.0)
@@ -193,37 +253,6 @@ def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarr
     capacity = next(c for c in CAPACITIES if c >= number)
     spare = capacity - number
     return np.pad(at, ((0, spare), (0, 0))), np.pad(weight * scale, (0, spare)), cell
-
-
-def _partition(
-    x: np.ndarray,
-    w: np.ndarray,
-    axes: np.ndarray,
-    u: np.ndarray,
-    noise: np.ndarray,
-    labels: np.ndarray,
-    objective: float,
-    delta: float,
-    status: int,
-) -> Partition:
-    pull = w[:, None] * u**2
-    centers = (pull.T @ x) / np.maximum(pull.sum(axis=0), np.finfo(x.dtype).tiny)[:, None]
-    squared = (((x[:, None] - centers) @ axes.T) ** 2).sum(axis=-1)
-    # Eq. 11 with m = 2: alpha goes with the root of the sum of u² D.
-    sizes = np.sqrt((pull * squared).sum(axis=0))
-    sizes = sizes / sizes.sum() if sizes.sum() > 0 else np.full(len(sizes), 1 / len(sizes))
-    return Partition(
-        centers=jnp.asarray(centers, x.dtype),
-        sizes=jnp.asarray(sizes, x.dtype),
-        memberships=jnp.asarray(u, x.dtype),
-        noise=jnp.asarray(noise, x.dtype),
-        labels=jnp.asarray(labels),
-        objective=jnp.asarray(objective, x.dtype),
-        steps=jnp.asarray(0),
-        status=jnp.asarray(status, jnp.int32),
-        m=2.0,
-        noise_distance=delta,
-    )
 
 
 def _shares(labels: np.ndarray, w: np.ndarray, k: int, dtype: Any) -> Array:

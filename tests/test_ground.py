@@ -190,6 +190,17 @@ def test_foreground_is_what_stands_on_the_table_before_the_wall():
     assert mask[(what == BALL) & (height > 2 * float(front.cut))].mean() > 0.99
 
 
+def test_a_wall_that_fills_the_view_is_still_a_wall():
+    """A small ball before it, three hundredths of what stands, is what the scene is about."""
+    points, what, std, _, _ = scene(np.radians(10), wall=0.5, balls=((0.05, 0.0, 0.05),))
+    standing = what != TABLE
+    assert (what[standing] == BALL).mean() < 0.1
+    front = foreground(points, fit_ground(points, depth_std=std))
+    assert len(front.walls) == 1
+    assert np.asarray(front.mask)[what == WALL].mean() < 0.02
+    assert np.asarray(front.mask)[what == BALL].mean() > 0.8
+
+
 def test_a_box_on_the_table_is_no_wall():
     """Its front face spans half the view and has nothing behind it, but there is table behind it."""
     points, _what, std, up, offset = scene(np.radians(35), balls=((0.0, -0.1, 0.03),))
