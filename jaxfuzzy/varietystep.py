@@ -28,11 +28,11 @@ Prototypes = dict[str, Array]
 
 @record
 class Task:
-    """What a step reads beside the prototypes, in the solving frame.
+    """What a step reads beside the prototypes, in the solving frame; points come last, which is several times faster.
 
     Attributes:
         features: Embedded points.
-        gradients: Derivatives of the embedding; None with the algebraic distance.
+        slopes: ∇phi ∇phiᵀ at each point; None with the algebraic distance.
         weights: Weight of each point.
         m: Fuzzifier.
         squared_noise: Squared noise distance, one or one a point; None without a noise cluster.
@@ -40,8 +40,8 @@ class Task:
         across: Number of directions off a variety, Q - q.
     """
 
-    features: Float[Array, "N Q"]
-    gradients: Float[Array, "N Q D"] | None
+    features: Float[Array, "Q N"]
+    slopes: Float[Array, "Q Q N"] | None
     weights: Float[Array, " N"]
     m: Float[Array, ""]
     squared_noise: Float[Array, "..."] | None
@@ -90,6 +90,7 @@ def pose(
         unit = jnp.where(unit > 0, unit, 1)
         points = jnp.where(used, (points - mean) / unit, 0)
         gradients = jnp.einsum("qm,nmd->nqd", table, monomial_gradients(points))
+        slopes = jnp.einsum("nqd,npd->qpn", gradients, gradients)
         features = monomials(points) @ table.T
         middle = lax.stop_gradient(weights @ features / weights.sum())
         features = jnp.where(used, features - middle, 0)
@@ -98,14 +99,14 @@ def pose(
         back, forward = (table @ change @ unmixed(table).T for change in (matrix, inverse))
         place = Frame(table @ constant + back @ middle, back, forward, unit)
     else:
-        features, gradients = monomials(points) @ table.T, None
+        features, slopes = monomials(points) @ table.T, None
         middle, unit = lax.stop_gradient(frame(features, weights))
         unit = jnp.where(unit > 0, unit, 1)
         features = jnp.where(used, (features - middle) / unit, 0)
         one = jnp.eye(middle.size, dtype=unit.dtype)
         place = Frame(middle, one * unit, one / unit, unit)
     squared_noise = None if noise_distance is None else jnp.square(noise_distance / unit)
-    return Task(features, gradients, weights, m, squared_noise, real, across), place
+    return Task(features.T, slopes, weights, m, squared_noise, real, across), place
 
 
 def step(theta: Prototypes, task: Task) -> tuple[Prototypes, Array]:
@@ -117,10 +118,10 @@ def step(theta: Prototypes, task: Task) -> tuple[Prototypes, Array]:
 
 def divide_points(theta: Prototypes, task: Task) -> tuple[Shares, Float[Array, "C N"]]:
     """How points divide themselves among the varieties and noise, and their squared distances from each variety."""
-    offset = task.features - theta["centers"][:, None]
-    squared = jnp.sum((offset @ theta["across"]) * offset, axis=-1)
-    if task.gradients is not None:
-        steepness = jnp.einsum("cqp,nqd,npd->cn", theta["across"], task.gradients, task.gradients)
+    offset = task.features - theta["centers"][:, :, None]
+    squared = jnp.einsum("cqn,cqp,cpn->cn", offset, theta["across"], offset)
+    if task.slopes is not None:
+        steepness = jnp.einsum("cqp,qpn->cn", theta["across"], task.slopes)
         # At an apex both vanish, the squared value faster: rounding in the divisor makes the quotient zero there.
         squared = squared / (jnp.maximum(steepness, 0) + jnp.finfo(squared.dtype).eps)
     squared = jnp.maximum(squared, 0)
@@ -145,12 +146,12 @@ def moments(share: Float[Array, "C N"], task: Task) -> Moments:
 
     Padded coordinates get an eigenvalue well above the smallest, so that none is ever a normal.
     """
-    centers, scatter = weighted_moments(task.features, share)
+    centers, scatter = weighted_moments(task.features.T, share)
     pad = jnp.diag(jnp.where(task.real, 0, 1).astype(scatter.dtype))
     total = lax.stop_gradient(jnp.trace(scatter, axis1=1, axis2=2))
-    if task.gradients is None:
+    if task.slopes is None:
         return centers, scatter + (1 + total)[:, None, None] * pad, None
-    metric = jnp.einsum("cn,nqd,npd->cqp", shares_of_one(share), task.gradients, task.gradients)
+    metric = jnp.einsum("cn,qpn->cqp", shares_of_one(share), task.slopes)
     # The smallest eigenvalue is no larger than the quotient of the traces.
     most = divide(total, lax.stop_gradient(jnp.trace(metric, axis1=1, axis2=2)))
     return centers, scatter + (1 + 2 * LEAST_GAP * most)[:, None, None] * pad, metric + pad
