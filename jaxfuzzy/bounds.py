@@ -14,6 +14,8 @@ from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Sphere
 from jaxfuzzy.rays import CLOSED, OPEN
 
 PRICE = 0.35
+# Squared sine of the tilt below which a plane counts as level.
+FLAT = 1e-4
 
 
 def stretch(values: np.ndarray) -> tuple[float, float, float]:
@@ -71,14 +73,17 @@ def ends_of(
             if detail[i]:
                 ends[i, 1 if detail[i] > 0 else 0] = theta[1 + i]
     elif kind == "plane":
-        first, second = _patch_axes(theta[:3])
+        first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]))
         a, b = hits[on] @ first, hits[on] @ second
         # The rectangle of least area, turned in its plane.
         turns = np.deg2rad(np.arange(0, 90, 3.0))
         u = np.cos(turns)[:, None] * a + np.sin(turns)[:, None] * b
         v = np.cos(turns)[:, None] * b - np.sin(turns)[:, None] * a
-        area = np.prod([np.subtract(*np.percentile(w, [97, 3], axis=1)) for w in (u, v)], axis=0)
-        best = int(np.argmin(area))
+        cut = max(1, round(0.03 * len(a)))
+        within = lambda w: (
+            np.diff(np.partition(w, (cut, -cut), axis=1)[:, [cut, -cut]])[:, 0] if len(a) > 2 * cut else 1.0
+        )
+        best = int(np.argmin(within(u) * within(v)))
         ends[0], ends[1], ends[2, 0] = stretch(u[best]), stretch(v[best]), turns[best]
     return ends
 
@@ -133,14 +138,18 @@ def assembled(
 
 
 def _patch_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    first, second = _patch_axes_jax(jnp.asarray(normal / np.linalg.norm(normal)))
-    return np.asarray(first), np.asarray(second)
+    """Two directions in a plane: the level one, or where the plane is level itself, x; and the one across."""
+    level = np.array([normal[2], 0.0, -normal[0]])
+    if level @ level < FLAT:
+        level = np.array([normal[1], -normal[0], 0.0])
+    first = level / np.sqrt(level @ level)
+    return first, np.cross(normal, first)
 
 
 def _patch_axes_jax(normal: Array) -> tuple[Array, Array]:
-    """Two directions in a plane: the level one, or where the plane is level itself, x; and the one across."""
+    """The same, traced."""
     level = jnp.stack([normal[2], jnp.zeros_like(normal[0]), -normal[0]])
-    flat = (level**2).sum() < 1e-4
+    flat = (level**2).sum() < FLAT
     level = jnp.where(flat, jnp.stack([normal[1], -normal[0], jnp.zeros_like(normal[0])]), level)
     first = level / jnp.sqrt((level**2).sum())
     return first, jnp.cross(normal, first)

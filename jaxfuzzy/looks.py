@@ -4,14 +4,16 @@ What fits no kind shows in the noise of its best surface: that of a wrong one is
 nothing of kinds, say it is.
 """
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
-from jaxfuzzy.objects import DEVIATIONS, Prepared, prepared, stacked
+from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, capacity_for, prepared, stacked
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
@@ -104,13 +106,20 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
     if not items:
         return []
     allowed = np.array([k in settings.kinds for k in KINDS])
-    batch = stacked(list(items), settings.dtype)
-    fitted = jax.device_get(fit_batch(batch, allowed, np.asarray(settings.gric), settings.along_ray))
+    capacity = capacity_for(items)
+
+    def fit(batch: Sequence[Prepared]) -> list[Fitted]:
+        padded = stacked(batch, capacity, settings.dtype)
+        fitted = jax.device_get(fit_batch(padded, allowed, np.asarray(settings.gric), settings.along_ray))
+        return [jax.tree.map(lambda a, i=i: a[i], fitted) for i in range(len(batch))]
+
+    # Batches of one compiled size, side by side on the processors there are.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = [f for batch in pool.map(fit, batches(items)) for f in batch]
     looks = []
-    for i, item in enumerate(items):
-        found = jax.tree.map(lambda a, i=i: a[i], fitted)
-        noise = max(1.0, float(found.local)) * found.deviation * np.median(1 / item.gain)
-        look = Look(item, found, expected[i] if expected else float(noise), Status(0))
+    for i, (item, fitted) in enumerate(zip(items, found, strict=True)):
+        noise = max(1.0, float(fitted.local)) * fitted.deviation * np.median(1 / item.gain)
+        look = Look(item, fitted, expected[i] if expected else float(noise), Status(0))
         looks.append(look._replace(reason=_reason(look)))
     return looks
 

@@ -5,15 +5,17 @@ neither place, heading nor unit of the cloud changes what the search sees. Point
 alone, and of which every beginning is a fair sample.
 """
 
+import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 # A noise distance is so many standard deviations; residuals are searched and weighed in deviations.
 DEVIATIONS = 2.5
-# Sizes that are compiled: points an object, and objects a batch. Beyond, powers of two.
-CAPACITIES = (1024, 2048)
-COUNTS = (1, 4, 8, 16, 24, 32)
+# Sizes that are compiled: points an object (beyond, powers of two) and objects a batch; an object that is not there costs nothing.
+CAPACITIES = (2048, 8192)
+BATCH = 16
 GOLDEN = 0.6180339887498949
 
 
@@ -71,37 +73,30 @@ def prepared(
         camera: Where they were seen from.
         along_ray: Whether deviations are along the viewing ray.
     """
-    middle = np.average(p, axis=0, weights=weight)
+    share = weight / weight.sum()
+    middle = share @ p
     if camera is not None and (camera - middle) @ up < 0:
         up = -up
-    forward = middle - camera if camera is not None else np.zeros(3)
-    forward = forward - up * (up @ forward)
-    if np.linalg.norm(forward) <= 1e-6 * np.linalg.norm(middle - (0 if camera is None else camera)):
-        # Seen from straight above, or by nobody: any level direction will do.
-        forward = np.eye(3)[np.argmin(np.abs(up))]
-        forward = forward - up * (up @ forward)
-    forward = forward / np.linalg.norm(forward)
-    turn = np.stack([np.cross(up, forward), up, forward])
+    turn = _upright(up, np.zeros(3) if camera is None else middle - camera)
     offset = (p - middle) @ turn.T
-    spread = np.sqrt(np.average(offset**2, axis=0, weights=weight))
-    unit = float(np.linalg.norm(spread))
+    scatter = (offset * share[:, None]).T @ offset
+    unit = float(np.sqrt(np.trace(scatter)))
     q = offset / (unit if unit > 0 else 1.0)
-    # Sorted by height and then dealt out by the golden ratio, whatever order the points came in.
+    # Sorted by height and then dealt out by the golden ratio, whatever order the points came in; weight 0 last.
     order = np.lexsort((q[:, 2], q[:, 0], q[:, 1]))
     order = order[np.argsort(np.arange(len(p)) * GOLDEN % 1.0, kind="stable")]
-    order = order[np.argsort(weight[order] == 0, kind="stable")]
-    eye, depth = np.zeros(3), q[:, 2]
-    ray, relative = np.zeros_like(q), np.ones(len(p))
+    if not share.all():
+        order = order[np.argsort(share[order] == 0, kind="stable")]
+    eye, depth, ray, relative = np.zeros(3), q[:, 2], np.zeros_like(q), np.ones(len(p))
     if along_ray and camera is not None:
         eye = turn @ (camera - middle) / (unit if unit > 0 else 1.0)
-        depth = np.linalg.norm(q - eye, axis=1)
-        ray = (q - eye) / np.maximum(depth, 1e-12)[:, None]
+        ray = q - eye
+        depth = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+        ray = ray / np.maximum(depth, 1e-12)[:, None]
         # Without a better word the deviation of stereo grows with the square of the distance.
-        relative = (depth / np.average(depth, weights=weight)) ** 2
+        relative = (depth / (share @ depth)) ** 2
     gain = 1 / (relative if deviation is None else deviation / (unit if unit > 0 else 1.0))
-    scatter = (
-        np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(q.T, aweights=weight, ddof=0)), 0)) if len(p) > 1 else np.zeros(3)
-    )
+    principal = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter), 0))
     return Prepared(
         points=q[order],
         rays=ray[order],
@@ -112,14 +107,24 @@ def prepared(
         depth_range=max(float(np.ptp(depth)), 1e-6),
         given=deviation is not None,
         frame=Frame(turn, middle, np.asarray(unit)),
-        flatness=(float(scatter[1] / max(scatter[2], 1e-300)), float(scatter[0] / max(scatter[2], 1e-300))),
+        flatness=(float(principal[1] / max(principal[2], 1e-300)), float(principal[0] / max(principal[2], 1e-300))),
     )
 
 
-def stacked(items: list[Prepared], dtype: Any) -> dict[str, np.ndarray]:
+def _upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) that makes `up` y and, as far as that allows, `forward` z."""
+    level = forward - up * (up @ forward)
+    if np.linalg.norm(level) <= 1e-6 * np.linalg.norm(forward):
+        # Seen from straight above, or by nobody: any level direction will do.
+        level = np.eye(3)[np.argmin(np.abs(up))]
+        level = level - up * (up @ level)
+    level = level / np.linalg.norm(level)
+    return np.stack([np.cross(up, level), up, level])
+
+
+def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, np.ndarray]:
     """One padded batch: weight 0 and a finite filler where there is no point."""
-    capacity = padded(max(len(o.points) for o in items), CAPACITIES)
-    count = padded(len(items), COUNTS)
+    count = BATCH
     batch = {
         "points": np.zeros((count, 3, capacity), dtype),
         "rays": np.zeros((count, 3, capacity), dtype),
@@ -137,6 +142,14 @@ def stacked(items: list[Prepared], dtype: Any) -> dict[str, np.ndarray]:
     return batch
 
 
-def padded(size: int, sizes: tuple[int, ...]) -> int:
-    """The smallest of a few sizes that is large enough; beyond them, the next power of two."""
-    return next((s for s in sizes if s >= size), 1 << (size - 1).bit_length())
+def capacity_for(items: Sequence[Prepared]) -> int:
+    """The smallest of a few sizes that holds every object's points; beyond them, the next power of two."""
+    most = max(len(o.points) for o in items)
+    return next((c for c in CAPACITIES if c >= most), 1 << (most - 1).bit_length())
+
+
+def batches(items: Sequence[Any]) -> list[Sequence[Any]]:
+    """Divided into as few batches as hold them, of about the same size."""
+    count = -(-len(items) // BATCH)
+    ends = np.linspace(0, len(items), count + 1).round().astype(int)
+    return [items[a:b] for a, b in itertools.pairwise(ends)]

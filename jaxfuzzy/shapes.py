@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import bounds, checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
 from jaxfuzzy.fitting import TOLERANCES, Fitted, assemble_batch
 from jaxfuzzy.looks import Look, Settings, look_at, unfit
-from jaxfuzzy.objects import COUNTS, DEVIATIONS, Frame, padded, prepared
+from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
@@ -191,20 +190,22 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 
 
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
-    """Shapes of all objects; primitives of one kind are made together."""
+    """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
     good = {i: look for i, look in looks.items() if not look.reason}
     made: dict[int, tuple[Primitive, np.ndarray]] = {}
-    ends = {i: _ends(look) for i, look in good.items()}
     for kind in KINDS:
-        made |= _assembled(kind, {i: o for i, o in good.items() if KINDS[o.fitted.kind] == kind}, ends, settings.dtype)
-    shapes = []
+        same = {i: o for i, o in good.items() if KINDS[o.fitted.kind] == kind}
+        for part in batches(list(same)):
+            made |= _assembled(kind, {i: same[i] for i in part}, settings.dtype)
+    arrays, rest = [], []
     for i, size in enumerate(sizes):
         if i in made:
-            shapes.append(_shape(looks[i], *made[i], settings))
+            own, told = _named(looks[i], *made[i], settings)
         else:
-            status = poor[i] or looks[i].reason
-            shapes.append(_unknown(size, looks.get(i), Status(status), settings))
-    return tuple(shapes)
+            own, told = _unknown(size, looks.get(i), Status(poor[i] or looks[i].reason), settings)
+        arrays.append(own)
+        rest.append(told)
+    return tuple(Shape(**own, **told) for own, told in zip(jax.device_put(arrays), rest, strict=True))
 
 
 def _on(look: Look) -> np.ndarray:
@@ -223,33 +224,24 @@ def _ends(look: Look) -> np.ndarray:
     return bounds.ends_of(kind, theta, hits, part, _on(look), detail)
 
 
-def _assembled(
-    kind: str, looks: dict[int, Look], ends: dict[int, np.ndarray], dtype: Any
-) -> dict[int, tuple[Primitive, np.ndarray]]:
-    """Primitives and their covariances."""
-    if not looks:
-        return {}
+def _assembled(kind: str, looks: dict[int, Look], dtype: Any) -> dict[int, tuple[Primitive, np.ndarray]]:
+    """Primitives of one kind and their covariances, padded by repetition to one compiled size."""
     chosen = list(looks)
-    # Padded by repetition to a few sizes, so that few are compiled.
-    rows = chosen + [chosen[0]] * (padded(len(chosen), COUNTS) - len(chosen))
+    rows = chosen + [chosen[0]] * (BATCH - len(chosen))
+    ends = {i: _ends(look) for i, look in looks.items()}
     stack = lambda of: np.stack([np.asarray(of(i), dtype) for i in rows])
     frame = Frame(*(stack(lambda i, f=f: getattr(looks[i].item.frame, f)) for f in Frame._fields))
     polished = lambda name: stack(lambda i: getattr(looks[i].fitted.polished, name))
-    primitives, covariances = jax.device_get(
-        assemble_batch(
-            kind,
-            polished("theta"),
-            polished("covariance"),
-            polished("turn"),
-            stack(lambda i: looks[i].fitted.detail),
-            stack(lambda i: ends[i]),
-            frame,
-        )
-    )
+    detail = stack(lambda i: looks[i].fitted.detail)
+    surface = (polished("theta"), polished("covariance"), polished("turn"), detail, stack(lambda i: ends[i]), frame)
+    primitives, covariances = jax.device_get(assemble_batch(kind, *surface))
     return {i: (jax.tree.map(lambda a, j=j: a[j], primitives), covariances[j]) for j, i in enumerate(chosen)}
 
 
-def _shape(look: Look, primitive: Primitive, covariance: np.ndarray, settings: Settings) -> Shape:
+def _named(
+    look: Look, primitive: Primitive, covariance: np.ndarray, settings: Settings
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The fields of a shape that has a name: those that are arrays, and the rest."""
     item, fitted = look.item, look.fitted
     kind = KINDS[fitted.kind]
     inliers = np.zeros(len(item.points), bool)
@@ -262,18 +254,14 @@ def _shape(look: Look, primitive: Primitive, covariance: np.ndarray, settings: S
         status |= Status.NOT_CONVERGED
     scale = 1.0 if item.given else float(fitted.polished.scale)
     deviation = np.median(1 / item.gain) * fitted.deviation * item.frame.unit * scale
-    return Shape(
-        primitive=primitive,
-        inliers=jnp.asarray(inliers),
-        noise_distance=jnp.asarray(DEVIATIONS * deviation, settings.dtype),
-        scores=scores,
-        margin=margin,
-        counts={},
-        covariance=jnp.asarray(covariance),
-        status=jnp.asarray(int(status), jnp.int32),
-        kind=kind,
-        guards=guards,
-    )
+    arrays = {
+        "primitive": primitive,
+        "inliers": inliers,
+        "noise_distance": np.asarray(DEVIATIONS * deviation, settings.dtype),
+        "covariance": covariance,
+        "status": np.asarray(status, np.int32),
+    }
+    return arrays, {"kind": kind, "scores": scores, "margin": margin, "counts": {}, "guards": guards}
 
 
 def _told(fitted: Fitted, kinds: tuple[str, ...]) -> tuple[dict[str, float], float, tuple[str, ...]]:
@@ -285,18 +273,15 @@ def _told(fitted: Fitted, kinds: tuple[str, ...]) -> tuple[dict[str, float], flo
     return scores, margin, tuple(f"{k}: {GUARDS[k]}" for k in scores if k not in passed)
 
 
-def _unknown(size: int, look: Look | None, status: Status, settings: Settings) -> Shape:
+def _unknown(size: int, look: Look | None, status: Status, settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The same of one that has none."""
     scores, margin, guards = ({}, 0.0, ()) if look is None else _told(look.fitted, settings.kinds)
     used = 0.0 if look is None else DEVIATIONS * float(np.median(1 / look.item.gain)) * float(look.item.frame.unit)
-    return Shape(
-        primitive=None,
-        inliers=jnp.zeros(size, bool),
-        noise_distance=jnp.asarray(used, settings.dtype),
-        scores=scores,
-        margin=margin,
-        counts={},
-        covariance=jnp.zeros((0, 0), settings.dtype),
-        status=jnp.asarray(int(status), jnp.int32),
-        kind="unknown",
-        guards=guards,
-    )
+    arrays = {
+        "primitive": None,
+        "inliers": np.zeros(size, bool),
+        "noise_distance": np.asarray(used, settings.dtype),
+        "covariance": np.zeros((0, 0), settings.dtype),
+        "status": np.asarray(status, np.int32),
+    }
+    return arrays, {"kind": "unknown", "scores": scores, "margin": margin, "counts": {}, "guards": guards}
