@@ -5,6 +5,7 @@
 
 from importlib.metadata import version as _version
 
+from jaxfuzzy import losses as losses
 from jaxfuzzy import plot as plot
 from jaxfuzzy.calibrate import calibrate as calibrate
 from jaxfuzzy.checks import DataError as DataError
@@ -40,6 +41,8 @@ from jaxfuzzy.seeding import histogram_seeds as histogram_seeds
 from jaxfuzzy.seeding import principal_axes as principal_axes
 from jaxfuzzy.segment import Segmentation as Segmentation
 from jaxfuzzy.segment import segment as segment
+from jaxfuzzy.sensitivity import Influence as Influence
+from jaxfuzzy.sensitivity import influence as influence
 from jaxfuzzy.shapes import Shape as Shape
 from jaxfuzzy.shapes import fit_shape as fit_shape
 from jaxfuzzy.shapes import fit_shapes as fit_shapes
@@ -49,6 +52,9 @@ from jaxfuzzy.status import describe as describe
 from jaxfuzzy.stereo import disparity as disparity
 from jaxfuzzy.stereo import example_pair as example_pair
 from jaxfuzzy.stereo import reconstruct as reconstruct
+from jaxfuzzy.tuning import Hyper as Hyper
+from jaxfuzzy.tuning import Tuned as Tuned
+from jaxfuzzy.tuning import tune as tune
 from jaxfuzzy.validity import ClusterCount as ClusterCount
 from jaxfuzzy.validity import choose_k as choose_k
 from jaxfuzzy.validity import fuzzy_silhouette as fuzzy_silhouette

@@ -236,6 +236,43 @@ def memberships(points: Float[ArrayLike, "N 2"], partition: Partition, ax: Any =
     return _plan_view(ax)
 
 
+def influence(
+    points: Float[ArrayLike, "N 3"],
+    by_weight: Float[ArrayLike, " N"],
+    ax: Any = None,
+    *,
+    up: Float[ArrayLike, "3"] = (0.0, -1.0, 0.0),
+    label: str = "change of the radius if left out (mm)",
+    factor: float = 1e3,
+) -> Any:
+    """Which points decide a number: each colored by what leaving it out would change, to first order, the strongest large.
+
+    `by_weight` is the derivative by the points' weights, as `jaxfuzzy.influence` gives it in `hyper.weights`.
+    """
+    ax = _axes(ax, (7, 6), projection="3d")
+    points, change = np.asarray(points, float), -factor * np.asarray(by_weight, float)
+    kept = _thinned(ax, len(points))
+    kept = kept[np.argsort(np.abs(change[kept]))]
+    places = points[kept] @ drawing.upright_frame(up).T
+    # The strongest points of a hundred all get the full color, or one alone would decide the picture.
+    limit = max(float(np.quantile(np.abs(change), 0.99)), 1e-300)
+    strength = np.minimum(np.abs(change[kept]) / limit, 1)
+    drawn = ax.scatter(
+        *places.T,
+        c=change[kept],
+        s=3 + 45 * strength,
+        cmap="PuOr",
+        vmin=-limit,
+        vmax=limit,
+        depthshade=False,
+        linewidths=0.2,
+        edgecolors="dimgray",
+    )
+    ax.figure.colorbar(drawn, ax=ax, label=label, shrink=0.6, extend="both")
+    _view(ax, places)
+    return ax
+
+
 def score_table(shapes: tuple[Shape, ...], ax: Any = None) -> Any:
     """The score of every kind for every object; lower is better, the kind that was chosen is marked."""
     kinds = list(dict.fromkeys(kind for shape in shapes for kind in shape.scores))

@@ -36,11 +36,14 @@ class Status(enum.IntFlag):
     REFUSED = 1 << 21
     LOW_MARGIN = 1 << 22
     UNSTABLE = 1 << 23
+    FLAT_LOSS = 1 << 24
+    STALLED = 1 << 25
+    RAN_AWAY = 1 << 26
 
 
 SENTENCES: dict[Status, str] = {
     Status.NOT_CONVERGED: "Stopped at max_steps before the change fell below tol: raise Solver(max_steps=...), loosen tol,"
-    " or start from other seeds.",
+    " or start from other seeds; in `tune`, raise steps.",
     Status.NOT_FINITE: "A result is not finite: look for NaN or infinite points, or rescale extreme values.",
     Status.COLLAPSED: "All centers sit at the mean, which is a local minimum for this fuzzifier: lower m.",
     Status.MERGED: "Two or more centers coincide, so their memberships are shared: ask for fewer clusters or lower m.",
@@ -65,6 +68,12 @@ SENTENCES: dict[Status, str] = {
     Status.REFUSED: "None of the known kinds fits: named 'quadric' or 'unknown' rather than guessed.",
     Status.LOW_MARGIN: "The best kind is barely better than the next: look at the scores.",
     Status.UNSTABLE: "Two centers coincide only because their seeds did and would part if nudged: start from other seeds.",
+    Status.FLAT_LOSS: "The loss changes with nothing that is tuned: let it read the values, or start where it does change.",
+    Status.STALLED: "No shorter step lowered the loss though its gradient is not zero: it jumps or bends here (labels flip,"
+    " clusters merge, a maximum is taken), or its fits are too coarse: use a smooth loss, tighten Solver(tol=...), or start"
+    " elsewhere.",
+    Status.RAN_AWAY: "Tuning drove a value far from its start, where the loss still falls: it has no minimum in a useful range;"
+    " bound the value, or use another loss.",
 }
 
 

@@ -14,7 +14,7 @@ ORDER = """
     seeding validity density segment meshes primitives refine recover bodies simulate
     objects rays bounds starts local choice candidates screening finalists search polish fitting looks shapes groups
     files cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
-    scene tuning drawing plot export folder page report table estimators arguments terminal cli __init__
+    scene losses tuning sensitivity drawing plot export folder page report table estimators arguments terminal cli __init__
 """.split()
 DOORS = {
     "cv2": {"rig", "rigfiles", "stereo", "photos", "calibrate", "matcher", "render", "reproject"},
@@ -90,11 +90,12 @@ def test_core_needs_no_extra():
 
 # The contract of the top level: taking a name away must be deliberate.
 PUBLIC = """
-    Box Cloud ClusterCount Cone Cylinder DataError Matcher NoiseRule Partition Plane Quadric Rig Scene Seeds Segmentation Shape
-    Solver Sphere Status Varieties
-    calibrate choose_k cloud_from_disparity conditioning describe disparity example_pair fcm find_ground fit_shape fit_shapes
-    fuzzy_silhouette histogram_seeds load_rig load_scene memberships model_cloud model_scene nfcv partition_coefficient
-    principal_axes read_cloud reconstruct recover rectify save_rig segment upright variance_ratio write_cloud xie_beni
+    Box Cloud ClusterCount Cone Cylinder DataError Hyper Influence Matcher NoiseRule Partition Plane Quadric Rig Scene
+    Seeds Segmentation Shape Solver Sphere Status Tuned Varieties
+    calibrate choose_k cloud_from_disparity conditioning describe disparity example_pair fcm find_ground fit_shape
+    fit_shapes fuzzy_silhouette histogram_seeds influence load_rig load_scene memberships model_cloud model_scene nfcv
+    partition_coefficient principal_axes read_cloud reconstruct recover rectify save_rig segment tune upright
+    variance_ratio write_cloud xie_beni
 """.split()
 
 

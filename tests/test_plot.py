@@ -115,6 +115,22 @@ def test_paper_stages(scene):
     assert plot.paper_stages(dataclasses.replace(scene, segmentation=few)) is None
 
 
+def test_influence_marks_the_points_that_decide():
+    places = np.random.default_rng(0).normal(size=(400, 3))
+    by_weight = np.full(400, 1e-5)
+    by_weight[:8], by_weight[7] = -1e-3, -2e-3
+    mine = Figure().add_subplot(projection="3d")
+    assert plot.influence(places, by_weight, mine, label="mm") is mine
+    (drawn,) = mine.collections
+    # Leaving out point 7 adds 2 mm; it is drawn last and largest, in the color of what adds.
+    assert drawn.get_array()[-1] == pytest.approx(2.0)
+    sizes = drawn.get_sizes()
+    assert sizes[-1] == sizes.max() > 10 * np.median(sizes)
+    new = plot.influence(places, by_weight)
+    shown = imread(io.BytesIO(plot.png(new.figure, dpi=50)))[..., :3]
+    assert shown.std() > 0.02, "the figure is blank"
+
+
 def test_png_repeats_itself(scene):
     figure = Figure()
     plot.histogram(seeds(), figure.add_subplot())
