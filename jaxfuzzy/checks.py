@@ -11,6 +11,9 @@ import numpy as np
 
 from jaxfuzzy.arrays import Array, as_float, is_concrete
 
+# Of scenes, in the unit of the points: from a tenth of a nanometre to beyond the moon, were it metres.
+SMALLEST, FARTHEST = 1e-10, 1e9
+
 
 class DataError(ValueError):
     """The data themselves rule out a result, however they are asked for: too few matches, nothing left to fit."""
@@ -28,6 +31,20 @@ def points(value: Any, name: str = "points", *, dims: int | None = None) -> Arra
     if dims is not None and array.shape[1] != dims:
         raise ValueError(f"{name} must have shape (N, {dims}), got {tuple(array.shape)}")
     return _finite(as_float(array), name)
+
+
+def places(value: Any, name: str = "points") -> Array:
+    """Points (N, 3) of a scene, in lengths whose squares and fourth powers single precision can hold."""
+    array = points(value, name, dims=3)
+    if is_concrete(array):
+        known = np.asarray(array)
+        largest, extent = float(np.abs(known).max()), float(np.ptp(known, axis=0).max())
+        if largest > FARTHEST or 0 < extent < SMALLEST:
+            raise ValueError(
+                f"{name} must lie within {FARTHEST:g} of the origin and extend over at least {SMALLEST:g}, got {largest:g} and"
+                f" {extent:g}: give them in another unit"
+            )
+    return array
 
 
 def weights(value: Any, count: int, name: str = "weights") -> Array | None:

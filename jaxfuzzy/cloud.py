@@ -11,9 +11,10 @@ import numpy as np
 
 from jaxfuzzy import cloudfiles
 from jaxfuzzy.arrays import Array, Float, Int, as_float, record
-from jaxfuzzy.files import read_bytes, write_atomic
+from jaxfuzzy.files import one_line, read_bytes, write_atomic
 
 SUFFIXES = (".ply", ".pcd", ".npy", ".npz", ".csv", ".xyz", ".txt")
+BESIDE = ("depth_std", "column_px", "row_px")
 COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
@@ -39,7 +40,8 @@ class Cloud:
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """Reads a point cloud: PLY, PCD, NPY, NPZ, CSV or XYZ, told apart by content. Nothing is unpickled.
 
-    Coordinates are taken as they are, in metres. Points that are not finite are left out, and a warning says how many.
+    Coordinates are taken as they are, in metres. Points that are not finite, or whose depth deviation or pixel is not, are
+    left out, and a warning says how many.
     What a file holds beside coordinates, colors and what `write_cloud` adds (normals, labels, ...) is passed over.
 
     Raises:
@@ -51,13 +53,16 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         if missing := [name for name in "xyz" if name not in columns]:
             raise ValueError(f"has no column {', '.join(missing)}, only {', '.join(columns)}")
         points = np.stack([columns[name] for name in "xyz"], axis=1)
-        if points.dtype.kind != "f":
-            points = points.astype(float)
-        finite = np.isfinite(points).all(axis=1)
+        # In the precision JAX will have them: what overflows there is as infinite as what was infinite before.
+        with np.errstate(over="ignore"):
+            kind = points.dtype.newbyteorder("=") if points.dtype.kind == "f" else np.dtype(float)
+            points = np.asarray(as_float(points.astype(kind)))
+            beside = {name: columns[name].astype(np.float32) for name in BESIDE if name in columns}
+        finite = np.isfinite(np.stack([*points.T, *beside.values()])).all(axis=0)
         if not finite.any():
             raise ValueError(f"holds no finite point, out of {len(points)}")
     except ValueError as error:
-        raise ValueError(f"cloud {os.fspath(path)} {error}".replace("\n", " ")) from None
+        raise ValueError(f"cloud {os.fspath(path)} {one_line(error)}") from None
     if not finite.all():
         warnings.warn(
             f"cloud {os.fspath(path)}: {int((~finite).sum())} of {len(points)} points are not finite and were left out",
@@ -65,13 +70,13 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         )
 
     def kept(*names: str) -> Array | None:
-        if not all(name in columns for name in names):
+        if not all(name in beside for name in names):
             return None
-        values = np.stack([columns[name][finite] for name in names], axis=1).astype(np.float32)
+        values = np.stack([beside[name][finite] for name in names], axis=1)
         return as_float(values[:, 0] if len(names) == 1 else values)
 
     return Cloud(
-        points=as_float(points[finite].astype(points.dtype.newbyteorder("="))),
+        points=as_float(points[finite]),
         colors=_colors(columns, finite),
         depth_std=kept("depth_std"),
         pixels_px=kept("column_px", "row_px"),
@@ -90,7 +95,8 @@ def write_cloud(
         ascii: Write PLY and PCD as text.
 
     Raises:
-        ValueError: The suffix is none of these, a column has another length, or the file cannot be written.
+        ValueError: The suffix is none of these, or a column has another length.
+        OSError: The file cannot be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:

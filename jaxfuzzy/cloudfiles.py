@@ -4,9 +4,10 @@ A file is whole or refused: what its header promises is compared with what is th
 """
 
 import io
-import zipfile
 
 import numpy as np
+
+from jaxfuzzy.files import read_arrays
 
 Columns = dict[str, np.ndarray]
 
@@ -94,6 +95,8 @@ def _ply_element_size(body: bytes, count: int, properties: list[list[str]], orde
                 if len(body) < at + kind.itemsize:
                     raise ValueError("is cut short")
                 length = int(np.frombuffer(body, kind, 1, at)[0])
+                if length < 0:
+                    raise ValueError(f"has a list of {length} numbers")
                 at += kind.itemsize + length * np.dtype(PLY_TYPES[words[2]]).itemsize
             if at > len(body):
                 break
@@ -131,6 +134,8 @@ def parse_pcd(data: bytes) -> Columns:
         if type_ not in PCD_TYPES or size not in ("1", "2", "4", "8") or (type_ == "F" and size in "12"):
             raise ValueError(f"has the field {field!r} of unknown type {type_} {size}")
         times = _count(repeat, "COUNT")
+        if times > LONGEST_HEADER:
+            raise ValueError(f"says {times} numbers for the field {field!r} of every point")
         kinds += [(f"{field}{'' if times == 1 else f'_{i}'}", f"<{PCD_TYPES[type_]}{size}") for i in range(times)]
     kinds = list(zip(_unique([name for name, _ in kinds]), [kind for _, kind in kinds], strict=True))
     layout = entries["DATA"][0]
@@ -202,11 +207,7 @@ def _lzf(data: bytes, size: int) -> bytes:
 
 def parse_numpy(data: bytes) -> Columns:
     """NPY (N, 3 or more), (H, W, 3 or more) or with named fields; NPZ with points or xyz, and colors or rgb."""
-    try:
-        loaded = np.load(io.BytesIO(data), allow_pickle=False)
-        arrays = {"points": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    except (ValueError, EOFError, OSError, MemoryError, KeyError, SyntaxError, zipfile.BadZipFile) as error:
-        raise ValueError(f"is damaged, cut short or holds Python objects ({type(error).__name__})") from None
+    arrays = read_arrays(data)
     name = next((name for name in ("points", "xyz", "arr_0") if name in arrays), None)
     if name is None:
         raise ValueError(f"holds neither 'points' nor 'xyz', only {', '.join(map(repr, arrays)) or 'nothing'}")

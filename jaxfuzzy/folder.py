@@ -1,11 +1,21 @@
-"""A folder of results, written all or nothing: as it was, or with every new file in its place."""
+"""A folder of results, written all or nothing: as it was, or with every new file in its place.
+
+A run that is killed while it moves files leaves a journal beside the old ones: until the last move the old files count, `standing`
+finds them for readers, and the next run puts them back before it begins.
+"""
 
 import contextlib
+import json
 import os
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path, PurePosixPath
+
+from jaxfuzzy.files import write_atomic
+
+PREFIX = ".jaxfuzzy-"
+JOURNAL = "journal"
 
 
 @contextlib.contextmanager
@@ -30,13 +40,14 @@ def staged(
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"out must be a folder, got the file {folder}")
+    _undo(folder)
     replaceable = tuple(name for name in earlier(folder) if not _leaves(name))
     _refuse_foreign(folder, replaceable, names)
     # Beside the folder, or inside where it exists: renaming then stays on one disk, and a mounted folder works too.
     base = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     stage = None
     try:
-        stage = Path(tempfile.mkdtemp(dir=base, prefix=".jaxfuzzy-"))
+        stage = Path(tempfile.mkdtemp(dir=base, prefix=PREFIX))
         yield stage
         if keep and folder.exists():
             _refuse_foreign(folder, replaceable, files_in(stage))
@@ -54,6 +65,11 @@ def staged(
     finally:
         if stage is not None:
             shutil.rmtree(stage, ignore_errors=True)
+
+
+def standing(folder: Path, name: str) -> Path:
+    """Where a file of the folder is that counts: among those put aside where a run was killed before its last move."""
+    return next((aside / name for aside in _interrupted(folder) if (aside / name).is_file()), folder / name)
 
 
 def files_in(folder: Path) -> list[str]:
@@ -75,15 +91,17 @@ def _leaves(name: str) -> bool:
 
 def _swap(stage: Path, folder: Path, replaceable: Collection[str]) -> None:
     """Moves what may be replaced out of the folder and the new files in; all of it or nothing."""
-    retired = Path(tempfile.mkdtemp(dir=folder, prefix=".jaxfuzzy-"))
-    moves = [(folder / name, retired / name) for name in replaceable if (folder / name).is_file()]
-    moves += [(stage / name, folder / name) for name in files_in(stage)]
+    retired = Path(tempfile.mkdtemp(dir=folder, prefix=PREFIX))
+    old, new = [name for name in replaceable if (folder / name).is_file()], files_in(stage)
+    moves = [(folder / name, retired / name) for name in old] + [(stage / name, folder / name) for name in new]
     begun = []
     try:
+        write_atomic(retired / JOURNAL, json.dumps({"old": old, "new": new, "stage": stage.name}).encode())
         for source, target in moves:
             target.parent.mkdir(parents=True, exist_ok=True)
             begun.append((source, target))
             source.replace(target)
+        (retired / JOURNAL).unlink()  # from here on the new files count
     except BaseException:
         for source, target in reversed(begun):
             if target.exists() and not source.exists():
@@ -94,3 +112,27 @@ def _swap(stage: Path, folder: Path, replaceable: Collection[str]) -> None:
         for parent in {(folder / name).parent for name in replaceable} - {folder}:
             with contextlib.suppress(OSError):
                 parent.rmdir()  # goes only where it is empty
+
+
+def _interrupted(folder: Path) -> list[Path]:
+    """What runs that were killed while they moved files had put aside."""
+    return [path.parent for path in folder.glob(f"{PREFIX}*/{JOURNAL}") if path.is_file()]
+
+
+def _undo(folder: Path) -> None:
+    """Puts back what a killed run had moved; may itself be killed and begun again."""
+    for aside in _interrupted(folder):
+        try:
+            tree = json.loads((aside / JOURNAL).read_bytes())
+            old, new = ([name for name in tree[of] if not _leaves(name)] for of in ("old", "new"))
+            stage = folder / PurePosixPath(tree["stage"]).name
+        except (ValueError, TypeError, KeyError):
+            continue  # not a journal of ours
+        for name in set(new) - set(old):
+            (folder / name).unlink(missing_ok=True)
+        for name in old:
+            if (aside / name).is_file():
+                (aside / name).replace(folder / name)
+        shutil.rmtree(aside, ignore_errors=True)
+        if stage.name.startswith(PREFIX):
+            shutil.rmtree(stage, ignore_errors=True)

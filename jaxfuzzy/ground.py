@@ -119,7 +119,7 @@ def fit_ground(
     max_tilt: float = np.pi * 50 / 180,
 ) -> Ground:
     """The supporting plane with its inliers, its own measure of the noise and a status. Arguments as for `find_ground`."""
-    cloud = checks.points(points, dims=3)
+    cloud = checks.places(points)
     dtype = cloud.dtype
     x = np.asarray(cloud)
     mass = checks.weights(weights, len(x))
@@ -172,7 +172,7 @@ def foreground(
         weights: Weights (N,).
         camera: Where the points were seen from (3,), or None.
     """
-    cloud = checks.points(points, dims=3)
+    cloud = checks.places(points)
     x = np.asarray(cloud)
     mass = checks.weights(weights, len(x))
     kept = np.ones(len(x), bool) if mass is None else np.asarray(mass) > 0
@@ -220,7 +220,7 @@ def upright(points: Float[ArrayLike, "N 3"], ground: Plane) -> tuple[Array, Arra
     Returns:
         The points turned (N, 3), the rotation (3, 3) and the origin (3,): turned = rotation @ (point - origin).
     """
-    cloud = checks.points(points, dims=3)
+    cloud = checks.places(points)
     rotation = upright_rotation(ground.normal).astype(cloud.dtype)
     origin = ground.point.astype(cloud.dtype)
     return (cloud - origin) @ rotation.T, rotation, origin

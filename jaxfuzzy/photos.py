@@ -1,17 +1,15 @@
 """Photographs before matching: reading them, what they say about their rectification, and rectifying them."""
 
 import dataclasses
-import io
 import os
 import re
-import zipfile
 from typing import Any
 
 import cv2
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.files import read_bytes
+from jaxfuzzy.files import one_line, read_arrays, read_bytes
 from jaxfuzzy.rig import Rig
 
 Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
@@ -70,10 +68,17 @@ def _eight_bits(image: np.ndarray, top: float) -> Image:
     return (image * (255.0 / max(top, 1e-12)) + 0.5).astype(np.uint8)
 
 
+def _decoded(data: bytes) -> Any:
+    """The image in a file's bytes; None where it is none that OpenCV reads."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError):  # it says a size that it cannot have
+        return None
+
+
 def _image(value: Any, name: str) -> np.ndarray:
     if isinstance(value, str | os.PathLike):
-        data = np.frombuffer(read_bytes(value, f"{name} image"), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        image = _decoded(read_bytes(value, f"{name} image"))
         if image is None:
             raise ValueError(f"{name} is not an image that can be read: {os.fspath(value)}")
     elif value is None:
@@ -116,21 +121,20 @@ def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.nd
         if data.startswith((b"Pf", b"PF")):
             values = _pfm(data)
         elif data.startswith((b"\x93NUMPY", b"PK")):
-            loaded = np.load(io.BytesIO(data), allow_pickle=False)
-            arrays = [loaded] if isinstance(loaded, np.ndarray) else [loaded[name] for name in loaded.files]
+            arrays = list(read_arrays(data).values())
             if len(arrays) != 1:
                 raise ValueError(f"holds {len(arrays)} arrays, one is needed")
             values = arrays[0]
         else:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            image = _decoded(data)
             if image is None:
                 raise ValueError("is no image, PFM, NPY or NPZ file")
             # Middlebury's 2001 maps are grey stored as color.
             values = image[:, :, 0] if image.ndim == 3 and np.ptp(image[:, :, :3], axis=2).max() == 0 else image
         if values.ndim != 2 or values.dtype.kind not in "fiu":
             raise ValueError(f"must hold one number a pixel, got {values.dtype} {values.shape}")
-    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile) as error:
-        raise ValueError(f"disparity {os.fspath(path)} {error}".replace("\n", " ")) from None
+    except ValueError as error:
+        raise ValueError(f"disparity {os.fspath(path)} {one_line(error)}") from None
     known = np.isfinite(values) if values.dtype.kind == "f" else values > 0
     return np.where(known, values.astype(np.float32) / np.float32(scale), np.float32(np.nan))
 

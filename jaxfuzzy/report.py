@@ -14,15 +14,12 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import importlib.util
-import io
 import json
 import math
 import os
 import platform
 import re
 import typing
-import zipfile
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +29,8 @@ import numpy as np
 
 from jaxfuzzy import drawing, export
 from jaxfuzzy.cloud import Cloud, write_cloud
-from jaxfuzzy.folder import files_in, staged
+from jaxfuzzy.files import one_line, read_arrays
+from jaxfuzzy.folder import files_in, staged, standing
 from jaxfuzzy.primitives import primitive_from_dict
 from jaxfuzzy.rig import load_rig, save_rig
 from jaxfuzzy.segment import Segmentation
@@ -151,10 +149,10 @@ def load(folder: str | os.PathLike[str]) -> "Scene":
     folder = Path(folder)
     tree = _tree(folder)
     needed = [name for name in ("arrays.npz", "rig.json") if name in tree["files"]]
-    if missing := [name for name in needed if not (folder / name).exists()]:
+    if missing := [name for name in needed if not standing(folder, name).exists()]:
         raise FileNotFoundError(f"scene in {folder} lacks {' and '.join(missing)}")
     try:
-        arrays = dict(np.load(io.BytesIO((folder / "arrays.npz").read_bytes()), allow_pickle=False))
+        arrays = read_arrays(standing(folder, "arrays.npz").read_bytes())
         dtype = jax.dtypes.canonicalize_dtype(tree["dtype"])
         shapes = []
         for entry in tree["shapes"]:
@@ -185,10 +183,10 @@ def load(folder: str | os.PathLike[str]) -> "Scene":
             status=jnp.asarray(tree["status"]),
             image=_restore(jax.Array, arrays, "image"),
             image_right=_restore(jax.Array, arrays, "image_right"),
-            rig=load_rig(folder / "rig.json") if "rig.json" in tree["files"] else None,
+            rig=load_rig(standing(folder, "rig.json")) if "rig.json" in tree["files"] else None,
         )
-    except (KeyError, TypeError, AttributeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"scene in {folder} is damaged ({type(error).__name__}: {error})") from None
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"scene in {folder} is damaged ({type(error).__name__}: {one_line(error)})") from None
 
 
 def can_draw() -> bool:
@@ -216,12 +214,12 @@ def _earlier(folder: Path) -> tuple[str, ...]:
 
 def _tree(folder: Path) -> dict[str, Any]:
     """What scene.json says."""
-    path = folder / "scene.json"
+    path = standing(folder, "scene.json")
     if not path.is_file():
         raise FileNotFoundError(f"no scene.json in {folder}")
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON ({error})") from None
     if not isinstance(tree, dict) or tree.get("schema") != SCHEMA:
         raise ValueError(f"{path} is JSON of another kind: schema must be {SCHEMA!r}")

@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 
 from jaxfuzzy import rigfiles
-from jaxfuzzy.files import read_bytes, write_atomic
+from jaxfuzzy.files import one_line, read_bytes, write_atomic
 
 SCHEMA = "jaxfuzzy/rig"
 VERSION = 1
+# Calibration files have a few thousand bytes; looking through a huge text line by line would only seem to hang.
+LARGEST_FILE = 1 << 20
 PLAUSIBLE_BASELINE_M = (1e-3, 10.0)
 
 
@@ -228,8 +230,8 @@ def load_rig(
             fields["translation"] = tuple(np.asarray(fields["translation"]) * unit)
         rig = Rig(**fields, metric=not missing)
     except ValueError as error:
-        raise ValueError(f"rig {os.fspath(path)} {error}") from None
-    except (KeyError, TypeError, IndexError, OverflowError) as error:
+        raise ValueError(f"rig {os.fspath(path)} {one_line(error)}") from None
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"rig {os.fspath(path)} is damaged or no calibration file ({type(error).__name__})") from None
     if rig.metric and not PLAUSIBLE_BASELINE_M[0] <= rig.baseline_m <= PLAUSIBLE_BASELINE_M[1]:
         warnings.warn(
@@ -244,7 +246,7 @@ def save_rig(path: str | os.PathLike[str], rig: Rig) -> None:
     """Writes a rig as JSON, whole or not at all.
 
     Raises:
-        ValueError: The folder does not exist or cannot be written.
+        OSError: The folder does not exist or cannot be written.
     """
     fields = {name: value for name, value in dataclasses.asdict(rig).items() if value is not None}
     text = json.dumps({"schema": SCHEMA, "version": VERSION} | fields, indent=2)
@@ -279,8 +281,11 @@ def _tuples(value: Any) -> Any:
 
 
 def _text(path: str | os.PathLike[str]) -> str:
+    data = read_bytes(path, "rig")
+    if len(data) > LARGEST_FILE:
+        raise ValueError(f"rig {os.fspath(path)} has {len(data)} bytes, no calibration has more than {LARGEST_FILE}")
     try:
-        return read_bytes(path, "rig").decode("utf-8")
+        return data.decode("utf-8")
     except UnicodeDecodeError:
         raise ValueError(f"rig {os.fspath(path)} is no text file, so no calibration") from None
 

@@ -34,7 +34,7 @@ def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rect
     Raises:
         ValueError: The text is in no known format, or what is there contradicts itself.
     """
-    if re.search(r"^\s*cam0\s*=", text, re.MULTILINE):
+    if re.search(r"^[ \t]*cam0[ \t]*=", text, re.MULTILINE):
         return middlebury(text)
     if re.search(r"^P(0|2|_rect_00|_rect_02):\s+[-+.\d]", text, re.MULTILINE):
         return kitti(text, cameras)
@@ -47,7 +47,7 @@ def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rect
 
 def middlebury(text: str) -> Fields:
     """Middlebury 2014 `calib.txt`: cam0, cam1, doffs, baseline in millimetres, width, height, ndisp."""
-    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.+?)\s*$", text, re.MULTILINE))
+    entries = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*\S)", text, re.MULTILINE))
     left = _numbers(entries["cam0"])
     right = _numbers(entries["cam1"]) if "cam1" in entries else None
     if len(left) != 9 or (right is not None and len(right) != 9):
@@ -69,7 +69,7 @@ def middlebury(text: str) -> Fields:
 
 def kitti(text: str, cameras: tuple[int, int] | None) -> Fields:
     """KITTI `calib.txt` (P0 ... P3) or `calib_cam_to_cam.txt` (P_rect_00 ...): rectified pairs, metres."""
-    entries = dict(re.findall(r"^\s*(\w+):\s*(.+?)\s*$", text, re.MULTILINE))
+    entries = dict(re.findall(r"^[ \t]*(\w+):[ \t]*(.*\S)", text, re.MULTILINE))
     matrices = {
         int(number): np.reshape(_numbers(entries[name]), (3, 4))
         for name in entries
@@ -145,6 +145,8 @@ def storage(text: str) -> Fields:
     """An OpenCV FileStorage (XML, YAML or JSON) or a ROS yaml file as nested dicts, matrices as arrays."""
     head = text.lstrip()[:200]
     if head.startswith("<"):
+        if "<!DOCTYPE" in text:
+            raise ValueError("is XML with a DOCTYPE, which no calibration needs")
         try:
             root = ElementTree.fromstring(text)
         except ElementTree.ParseError as error:
@@ -161,7 +163,7 @@ def storage(text: str) -> Fields:
 def _yaml(text: str) -> Fields:
     """The part of YAML that calibration files use: nested mappings, numbers, and lists in brackets or by dashes."""
     text = re.sub(r"^%.*$|^---.*$|\s#.*$|^\.\.\.$", "", text, flags=re.MULTILINE)
-    text = re.sub(r"\[[^\]]*\]", lambda match: re.sub(r"\s+", " ", match.group()), text)
+    text = re.sub(r"\[[^\[\]]*\]", lambda match: re.sub(r"\s+", " ", match.group()), text)
     root: Fields = {}
     stack: list[tuple[int, Fields]] = [(-1, root)]
     last: tuple[Fields, str] | None = None

@@ -183,7 +183,7 @@ def _model(
     weights: Any = None,
     **options: Any,
 ) -> Scene:
-    points = checks.points(cloud.points, "cloud.points", dims=3)
+    points = checks.places(cloud.points, "cloud.points")
     count = points.shape[0]
     vertical = CAMERA_UP if isinstance(up, str) else checks.direction(up, "up")
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}

@@ -12,6 +12,8 @@ from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, record
 
 # A valley parts two agglomerates where the lower peak rises above it by this many standard deviations of a count.
 VALLEY_SIGMAS = 2.0
+# More bins than this tell nothing more, however heavy the points are (Rice's rule reaches them at 1e12 points).
+MOST_BINS = 20_000
 
 
 @record
@@ -64,23 +66,23 @@ def histogram_seeds(points: ArrayLike, k: int, *, bins: int | None = None, weigh
     Args:
         points: Points (N, D).
         k: Number of seeds, at most N.
-        bins: Number of bins; None takes twice the cube root of the points' weight (Rice's rule), at least 8.
+        bins: Number of bins; None takes twice the cube root of the points' weight (Rice's rule), at least 8; at most 20,000.
         weights: Weight of each point (N,).
 
     Raises:
-        ValueError: `k` below 1 or above N, `bins` below 1, points that are not finite.
+        ValueError: `k` below 1 or above N, `bins` below 1 or above 20,000, points that are not finite.
     """
     array = checks.points(points)
     checks.integer(k, "k", at_least=1, at_most=array.shape[0], why=" (the number of points)")
     if bins is not None:
-        checks.integer(bins, "bins", at_least=1)
+        checks.integer(bins, "bins", at_least=1, at_most=MOST_BINS)
     rows, heaviness = _eager(array, weights)
     mean, axes, _ = principal_axes(rows, heaviness)
     along = (rows - mean) @ axes[0]
     present = heaviness > 0
     low, high = along[present].min(), along[present].max()
     # Counting weight, not rows, makes weight 2 the same as the point twice.
-    bins = bins or max(8, round(2 * heaviness.sum() ** (1 / 3)))
+    bins = bins or min(max(8, round(2 * heaviness.sum() ** (1 / 3))), MOST_BINS)
     edges = np.linspace(low, high if high > low else low + 1, bins + 1)
     place = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, len(edges) - 2)
     counts = np.bincount(place, heaviness, len(edges) - 1)

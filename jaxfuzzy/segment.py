@@ -91,7 +91,7 @@ def segment(
     Raises:
         ValueError: An argument out of range or of wrong shape; TypeError: of wrong kind.
     """
-    cloud = checks.points(points, dims=3)
+    cloud = checks.places(points)
     count = cloud.shape[0]
     given = checks.weights(weights, count)
     checks.choice(rule, "rule", ("robust", "paper"))

@@ -94,7 +94,7 @@ def fit_shape(
         ValueError: An argument out of range or of wrong shape.
         TypeError: An argument of wrong kind.
     """
-    array = checks.points(points, dims=3)
+    array = checks.places(points)
     return fit_shapes(
         array,
         np.zeros(len(array), int),
@@ -140,7 +140,7 @@ def fit_shapes(
         ValueError: An argument out of range or of wrong shape.
         TypeError: An argument of wrong kind.
     """
-    array = checks.points(points, dims=3)
+    array = checks.places(points)
     count = len(array)
     label = checks.labels(labels, count)
     delta = _noise(noise_distance, count)

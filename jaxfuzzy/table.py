@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxfuzzy import cloudfiles
 from jaxfuzzy.fcm import Partition
-from jaxfuzzy.files import read_bytes, write_atomic
+from jaxfuzzy.files import one_line, read_arrays, read_bytes, write_atomic
 
 WRITTEN = (".csv", ".json", ".npz")
 
@@ -46,7 +46,7 @@ def read_points(path: str | os.PathLike[str], columns: Sequence[str] = ()) -> tu
         chosen = _chosen(names, columns)
         return [names[i] for i in chosen], table[:, chosen]
     except ValueError as error:
-        raise ValueError(f"points {os.fspath(path)} {error}") from None
+        raise ValueError(f"points {os.fspath(path)} {one_line(error)}") from None
 
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
@@ -63,7 +63,8 @@ def write_points(path: str | os.PathLike[str], names: Sequence[str], points: np.
     """Writes points with their label, their membership in each cluster and in noise: CSV, JSON or NPZ by suffix.
 
     Raises:
-        ValueError: The suffix is none of these, or the file cannot be written.
+        ValueError: The suffix is none of these.
+        OSError: The file cannot be written.
     """
     check_suffix(path)
     labels, noise = np.asarray(partition.labels), np.asarray(partition.noise)
@@ -94,13 +95,7 @@ def write_points(path: str | os.PathLike[str], names: Sequence[str], points: np.
 
 
 def _from_numpy(data: bytes) -> tuple[list[str], np.ndarray]:
-    try:
-        loaded = np.load(io.BytesIO(data), allow_pickle=False)
-        arrays = {"points": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-    except (
-        Exception
-    ) as error:  # NumPy has no error of its own for a damaged file: zip, zlib, pickle and memory errors all occur
-        raise ValueError(f"is damaged, cut short or holds Python objects ({type(error).__name__})") from None
+    arrays = read_arrays(data)
     if "points" not in arrays and len(arrays) != 1:
         raise ValueError(f"must hold an array 'points' or a single one, got {', '.join(arrays) or 'none'}")
     table = arrays.get("points", next(iter(arrays.values())))

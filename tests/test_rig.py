@@ -234,7 +234,7 @@ def test_missing_and_binary_files(tmp_path):
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
     with pytest.raises(ValueError, match="no text file"):
         load_rig(tmp_path / "image.png")
-    with pytest.raises(ValueError, match="cannot write"):
+    with pytest.raises(OSError, match="cannot write"):
         save_rig(tmp_path / "no" / "rig.json", Rig(**GIVEN))
 
 
