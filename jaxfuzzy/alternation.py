@@ -4,6 +4,8 @@ Paper symbols → words: v centers, alpha sizes, u memberships; S_i, the sum of 
 a dictionary of centers and, where sizes are learned, their logarithms, in units where the points' RMS spread is 1.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -18,6 +20,10 @@ SAME_PLACE = 1e-2
 # What a step reads besides the prototypes: tiles, fuzzifier, squared noise distance, which clusters are real.
 Args = tuple[Tiles, Array, Array | None, Array | None]
 Theta = dict[str, Array]
+# powers(squared distances, fuzzifier, log strengths, squared noise distance, shift) -> (u^m, objective terms, new shift)
+Powers = Callable[[Array, Array, Array | None, Array | None, Array], tuple[Array, Array, Array]]
+# A shift is never below this, so that a tile of points without weight cannot lower it to -inf.
+LOWEST = -1e4
 
 
 @record
@@ -53,13 +59,14 @@ def strengths_of(theta: Theta, mask: Array | None) -> Float[Array, " K"] | None:
     return None if strengths is None else strengths.astype(theta["centers"].dtype)
 
 
-def sweep(theta: Theta, args: Args, *, square: bool, exact: bool, scatter: bool) -> Sums:
+def sweep(theta: Theta, args: Args, *, powers: Powers, exact: bool, scatter: bool) -> Sums:
     """One pass over the points.
 
     Args:
         theta: Prototypes.
         args: What else it reads.
-        square: Take the short cut for m = 2.
+        powers: How memberships are raised to the fuzzifier: `smooth_powers` carries every derivative, `short_powers` is
+            quicker, `square_powers` the quickest, for m = 2 alone.
         exact: Take distances by differences.
         scatter: Add up the scatter too, which is left at zero otherwise.
     """
@@ -68,21 +75,13 @@ def sweep(theta: Theta, args: Args, *, square: bool, exact: bool, scatter: bool)
     distances = squared_distances if exact else expanded_distances
     clusters, dims = centers.shape
     dtype = centers.dtype
-    lowest = jnp.asarray(-1e4, dtype)
     zero = jnp.zeros((), dtype)
 
     def add(sums: tuple[Array, Array, Array, Array], block: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         moments, scatters, objective, shift = sums
         apart = distances(block, centers)
-        if square:
-            power, term = _square_powers(apart, strengths, squared_noise)
-            new_shift, rescale = zero, jnp.ones((), dtype)
-        else:
-            part = shares(apart, m, strengths, squared_noise)
-            logs = part.log_powers(m)
-            new_shift = jax.lax.stop_gradient(jnp.maximum(shift, jnp.maximum(logs.max(), lowest)))
-            rescale = jnp.exp(shift - new_shift)
-            power, term = jnp.exp(logs - new_shift), part.objective(m, new_shift)
+        power, term, new_shift = powers(apart, m, strengths, squared_noise, shift)
+        rescale = jnp.exp(shift - new_shift)
         power = power * w
         return (
             moments * rescale + jnp.matmul(power, block.T, precision=jax.lax.Precision.HIGHEST),
@@ -95,16 +94,55 @@ def sweep(theta: Theta, args: Args, *, square: bool, exact: bool, scatter: bool)
         jnp.zeros((clusters, dims + 2), dtype),
         jnp.zeros(clusters, dtype),
         zero,
-        zero if square else 2 * lowest,
+        jnp.full((), 0 if powers is square_powers else 2 * LOWEST, dtype),
     )
     moments, scatters, objective, shift = sum_tiles(tiles, add, start)
     return Sums(moments[:, -1], moments[:, :dims], scatters, jnp.log(objective) + shift, shift)
 
 
-def _square_powers(
-    apart: Float[Array, "K n"], strengths: Float[Array, " K"] | None, squared_noise: Array | None
-) -> tuple[Float[Array, "K n"], Float[Array, " n"]]:
-    """Squared memberships and objective terms for m = 2, where no logarithm is needed."""
+def smooth_powers(
+    apart: Float[Array, "K n"], m: Array, strengths: Array | None, squared_noise: Array | None, shift: Array
+) -> tuple[Float[Array, "K n"], Float[Array, " n"], Float[Array, ""]]:
+    """Memberships to the power m and objective terms, both over exp(new shift), and that shift; with every derivative."""
+    part = shares(apart, m, strengths, squared_noise)
+    logs = part.log_powers(m)
+    shift = jax.lax.stop_gradient(jnp.maximum(shift, jnp.maximum(logs.max(), LOWEST)))
+    return jnp.exp(logs - shift), part.objective(m, shift), shift
+
+
+def short_powers(
+    apart: Float[Array, "K n"], m: Array, strengths: Array | None, squared_noise: Array | None, shift: Array
+) -> tuple[Float[Array, "K n"], Float[Array, " n"], Float[Array, ""]]:
+    """The same with one exponential a distance.
+
+    A part e = K alpha ratio^r with ratio = nearest / D has e^m = e ratio (K alpha)^(m - 1), as r (m - 1) = 1.
+    """
+    if strengths is not None:
+        apart = jnp.where((strengths == -jnp.inf)[:, None], jnp.inf, apart)
+    nearest = apart.min(axis=0)
+    if squared_noise is not None:
+        nearest = jnp.minimum(nearest, squared_noise)
+    on_it = apart <= 0
+    ratio = jnp.where(on_it, 1, nearest / jnp.where(on_it, 1, apart))
+    r = 1 / (m - 1)
+    part = jnp.exp(r * jnp.log(ratio))
+    power = part * ratio
+    if strengths is not None:
+        part = part * jnp.exp(strengths)[:, None]
+        power = power * jnp.exp(m * strengths)[:, None]
+    total = part.sum(axis=0)
+    if squared_noise is not None:
+        total = total + jnp.exp(r * jnp.log(nearest / squared_noise))
+    log_total = jnp.log(total)
+    shift = jnp.maximum(shift, jnp.maximum((-m * log_total).max(), LOWEST))
+    return power * jnp.exp(-m * log_total - shift), nearest * jnp.exp((1 - m) * log_total - shift), shift
+
+
+def square_powers(
+    apart: Float[Array, "K n"], m: Array, strengths: Array | None, squared_noise: Array | None, shift: Array
+) -> tuple[Float[Array, "K n"], Float[Array, " n"], Float[Array, ""]]:
+    """The same for m = 2, where neither logarithm nor shift is needed."""
+    del m
     # Distances are relative to a spread of 1, so the square of rounding stands for zero without overflow.
     floor = jnp.square(jnp.finfo(apart.dtype).eps)
     closeness = 1 / jnp.maximum(apart, floor)
@@ -113,13 +151,14 @@ def _square_powers(
     total = closeness.sum(axis=0)
     if squared_noise is not None:
         total = total + 1 / squared_noise
-    return jnp.square(closeness / total), 1 / total
+    share = 1 / total
+    return jnp.square(closeness * share), share, shift
 
 
-def step(theta: Theta, args: Args, *, sizes: bool, square: bool, exact: bool) -> tuple[Theta, Array]:
+def step(theta: Theta, args: Args, *, sizes: bool, powers: Powers, exact: bool) -> tuple[Theta, Array]:
     """One round of alternating optimisation (eqs. 9, 10, 11) and the objective where it started from."""
     _, m, _, mask = args
-    sums = sweep(theta, args, square=square, exact=exact, scatter=sizes)
+    sums = sweep(theta, args, powers=powers, exact=exact, scatter=sizes)
     filled = sums.mass > 0
     mass = jnp.where(filled, sums.mass, 1)
     centers = jnp.where(filled[:, None], sums.moment / mass[:, None], theta["centers"])
@@ -149,7 +188,7 @@ def step_jacobian(theta: Theta, args: Args, *, sizes: bool) -> Float[Array, "p p
     clusters, dims = centers.shape
     rows = dims + 1 if sizes else dims
     r = 1 / (m - 1)
-    shift = sweep(theta, args, square=False, exact=True, scatter=False).shift
+    shift = sweep(theta, args, powers=smooth_powers, exact=True, scatter=False).shift
 
     def add(sums: tuple[Array, Array, Array, Array], block: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         crossed, own, mass, scatter = sums

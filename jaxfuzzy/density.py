@@ -22,7 +22,7 @@ PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
 SWEEPS = 10
 # Bandwidths that the number of groups is looked for at: two ladders of a factor 2 in h², interleaved, over the first one's base.
 LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
-BASE = 2
+BASE, STEADY = 2, 3
 # Lengths in bandwidths: distance between seeds, noise distance, farthest neighbour, margin of the box that background is sought in.
 APART, DELTA, REACH, MARGIN = 2.0, 2.4, 7.2, 4.0
 # A seed stands so many standard deviations of a count above the background, which is the median over a lattice.
@@ -171,7 +171,11 @@ def _rank(values: Array) -> Array:
 
 
 def _steadiest(counts: Int[Array, " L"]) -> Int[Array, ""]:
-    """Of a ladder of bandwidths, one at which the number of groups is the one that stays longest; near the base."""
+    """Of a ladder of bandwidths, one at which the number of groups is the one that stays longest; near the base.
+
+    Where none stays for `STEADY` rungs there is detail at every scale, as in a crowded photograph, and a number that two rungs
+    share is chance: the base is taken.
+    """
     rungs = jnp.arange(len(counts))
     same = counts[:, None] == counts
     # A run from i to j is whole when no rung between differs.
@@ -182,7 +186,8 @@ def _steadiest(counts: Int[Array, " L"]) -> Int[Array, ""]:
     length = run.sum(axis=1)
     # Of two that stay as long the narrower; within a run the rung nearest to the base.
     first = jnp.argmax(run, axis=1)
-    return jnp.argmin(-length * 10000 + first * 100 + jnp.abs(rungs - BASE))
+    longest = jnp.argmin(-length * 10000 + first * 100 + jnp.abs(rungs - BASE))
+    return jnp.where(length.max() >= STEADY, longest, BASE)
 
 
 def _supports(

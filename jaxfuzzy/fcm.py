@@ -12,7 +12,18 @@ import jax
 import jax.numpy as jnp
 
 from jaxfuzzy import checks
-from jaxfuzzy.alternation import Theta, diagnose, log_sizes_of, step, step_jacobian, strengths_of, sweep
+from jaxfuzzy.alternation import (
+    Theta,
+    diagnose,
+    log_sizes_of,
+    short_powers,
+    smooth_powers,
+    square_powers,
+    step,
+    step_jacobian,
+    strengths_of,
+    sweep,
+)
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, is_concrete, record, static
 from jaxfuzzy.memberships import shares
 from jaxfuzzy.solve import Effort, Solver, fixed_point
@@ -166,8 +177,9 @@ def _fit(
         real = jnp.ones(clusters, bool) if mask is None else mask
         start["log_sizes"] = jnp.where(real, -jnp.log(real.sum().astype(points.dtype)), 0)
     # Static flags are bound here; what is traced goes through the arguments.
-    short = partial(step, sizes=sizes, square=square, exact=tiles.blocks.shape[0] == 1)
-    smooth = partial(step, sizes=sizes, square=False, exact=True)
+    powers = square_powers if square else short_powers
+    short = partial(step, sizes=sizes, powers=powers, exact=tiles.blocks.shape[0] == 1)
+    smooth = partial(step, sizes=sizes, powers=smooth_powers, exact=True)
     solve = partial(fixed_point, short, solver=effort, smooth_step=smooth, jacobian=partial(step_jacobian, sizes=sizes))
     if rule is not None:
         plain = solve(start, (tiles, m, None, mask))
@@ -177,7 +189,7 @@ def _fit(
     args = (tiles, m, squared_noise, mask)
     solution = solve(start, args)
     theta = solution.theta
-    sums = sweep(theta, args, square=False, exact=True, scatter=True)
+    sums = sweep(theta, args, powers=smooth_powers, exact=True, scatter=True)
     status = diagnose(theta, args, sums, solution.converged, sizes=sizes)
     partition = Partition(
         centers=tiles.mean + tiles.scale * theta["centers"],

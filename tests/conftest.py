@@ -17,3 +17,10 @@ def shared_data():
     if not DATA.is_dir():
         pytest.skip(f"real data not found at {DATA}")
     return DATA
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_programs():
+    """Compiled programs hold memory maps, of which Linux grants a process 65,530; XLA crashes beyond them."""
+    yield
+    jax.clear_caches()

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import oracles
+from jaxfuzzy.alternation import short_powers, smooth_powers, square_powers
 from jaxfuzzy.fcm import NoiseRule, _fit, fcm, memberships
 from jaxfuzzy.solve import Solver
 from jaxfuzzy.status import Status
@@ -341,3 +342,30 @@ def test_integers_and_half_floats_are_taken():
     assert (
         fcm(np.arange(20.0).reshape(10, 2).astype(np.float16), np.ones((1, 2), np.float16)).centers.dtype == np.float64
     )
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("m", [1.05, 1.7, 2.0, 5.0, 30.0])
+@pytest.mark.parametrize("with_noise", [False, True])
+@pytest.mark.parametrize("with_sizes", [False, True])
+def test_short_cuts_give_the_same_powers(dtype, m, with_noise, with_sizes):
+    apart = np.random.default_rng(0).chisquare(3, (4, 64)).astype(dtype)
+    apart[1, 3] = apart[0, 5] = apart[2, 5] = 0
+    apart[3] *= 1e-4
+    args = [jnp.asarray(m, dtype), None, None, jnp.asarray(-2e4, dtype)]
+    if with_sizes:
+        args[1] = jnp.asarray(
+            np.log([2.0, 1.5, 0.5, 0.0], where=[True, True, True, False], out=np.full(4, -np.inf)), dtype
+        )
+    if with_noise:
+        args[2] = jnp.asarray(0.7, dtype)
+    cuts = [short_powers] + [square_powers] * (m == 2)
+    for cut in cuts:
+        (power, term, shift), (exact, exact_term, exact_shift) = cut(apart, *args), smooth_powers(apart, *args)
+        # Logarithms of up to 1e2 / (m - 1) carry that many units of rounding into the exponential; the shift is cut's own.
+        tol = 1e3 * np.finfo(dtype).eps * max(1, 1 / (m - 1))
+        factor = np.exp(np.float64(shift if cut is short_powers else 0) - np.float64(exact_shift))
+        np.testing.assert_allclose(np.asarray(power, float) * factor, exact, rtol=tol, atol=tol)
+        np.testing.assert_allclose(
+            np.asarray(term, float) * factor, exact_term, rtol=tol, atol=tol * np.max(exact_term)
+        )

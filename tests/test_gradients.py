@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from jaxfuzzy.alternation import step, step_jacobian
+from jaxfuzzy.alternation import smooth_powers, step, step_jacobian
 from jaxfuzzy.fcm import NoiseRule, fcm
 from jaxfuzzy.solve import Solver
 from jaxfuzzy.status import Status
@@ -130,7 +130,7 @@ def test_step_derivative_is_that_of_the_step():
         flat, unravel = ravel_pytree(theta)
 
         def flat_step(y, unravel=unravel, args=args, sizes=sizes):
-            return ravel_pytree(step(unravel(y), args, sizes=sizes, square=False, exact=True)[0])[0]
+            return ravel_pytree(step(unravel(y), args, sizes=sizes, powers=smooth_powers, exact=True)[0])[0]
 
         expected = jax.jacfwd(flat_step)(flat)
         np.testing.assert_allclose(step_jacobian(theta, args, sizes=sizes), expected, atol=1e-13)

@@ -84,7 +84,8 @@ def test_seeds_are_mountains_apart():
         ([5, 4, 3, 2, 2, 2, 2, 1], 3),  # 2 stays longest, from the fourth on
         ([2, 2, 1, 1, 1, 2, 2, 2], 2),  # a number that comes back has two runs
         ([1] * 8, 2),
-        ([8, 7, 6, 5, 4, 3, 2, 1], 0),
+        ([8, 7, 6, 5, 4, 3, 2, 1], 2),  # none stays: the base
+        ([16, 15, 14, 11, 9, 9, 7, 5], 2),  # two alike are chance
     ],
 )
 def test_the_number_that_stays_longest(counts, level):
