@@ -122,7 +122,9 @@ def _picture(theta: Array, view: View) -> tuple[Array, Array]:
     """Coordinates (H, 3, N) in which the extent of each face is judged: the picture's, or without a camera its own."""
     if view.ray is not None:
         u, v, w = columns(view.ray)
-        return (u / w)[:, None], (v / w)[:, None]
+        # Padding has no ray.
+        ahead = jnp.where(w > 0, w, 1.0)
+        return (u / ahead)[:, None], (v / ahead)[:, None]
     c, s = jnp.cos(theta[:, :1]), jnp.sin(theta[:, :1])
     x, y, z = columns(view.point)
     first, second = c * x + s * z, c * z - s * x
