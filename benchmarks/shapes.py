@@ -33,7 +33,13 @@ from jaxfuzzy.simulate import KINDS, OTHERS, Simulated, simulate_object
 # Seeds of the clouds that settings were frozen on, and of those that are reported.
 TUNING, REPORTED = 0, 100_000
 OUTLIERS = (0.0, 0.1, 0.3, 0.5)
-MEASURES = {"cylinder": "radius %", "sphere": "radius %", "cone": "half-angle deg", "box": "yaw deg", "plane": "normal deg"}
+MEASURES = {
+    "cylinder": "radius %",
+    "sphere": "radius %",
+    "cone": "half-angle deg",
+    "box": "yaw deg",
+    "plane": "normal deg",
+}
 
 
 def clouds(kinds: Sequence[str], each: int, seed: int, outliers: Sequence[float], **options: Any) -> list[Simulated]:
@@ -89,7 +95,9 @@ def _made(row: dict[str, Any], each: int, seed: int) -> list[Simulated]:
     if "tilts" not in row:
         return clouds(kinds, each, seed, outliers, **made)
     tilts = row["tilts"]
-    return [c for i, t in enumerate(tilts) for c in clouds(kinds, -(-each // len(tilts)), seed + 1000 * i, outliers, tilt=t)]
+    return [
+        c for i, t in enumerate(tilts) for c in clouds(kinds, -(-each // len(tilts)), seed + 1000 * i, outliers, tilt=t)
+    ]
 
 
 def naming(each: int, seed: int, **_: Any) -> dict[str, Any]:
@@ -102,7 +110,9 @@ def naming(each: int, seed: int, **_: Any) -> dict[str, Any]:
         made = np.array([c.truths[0].made for c in given])
         by_kind = {k: 100 * float(good[made == k].mean()) for k in dict.fromkeys(made)}
         wrong = [
-            (str(c.truths[0].made), s.kind, i) for i, (c, s) in enumerate(zip(given, shapes, strict=True)) if not good[i]
+            (str(c.truths[0].made), s.kind, i)
+            for i, (c, s) in enumerate(zip(given, shapes, strict=True))
+            if not good[i]
         ]
         mistakes: dict[str, int] = {}
         for m, k, _ in wrong:
@@ -287,9 +297,14 @@ def invariance(each: int, seed: int, **_: Any) -> dict[str, Any]:
                 if again.kind != base.kind:
                     renamed += 1
                     continue
-                worst[name] = max(worst.get(name, 0.0), float(np.abs(_sizes(again) / unit ** _POWERS.get(base.kind, 0) / _sizes(base) - 1).max(initial=0)))
+                worst[name] = max(
+                    worst.get(name, 0.0),
+                    float(np.abs(_sizes(again) / unit ** _POWERS.get(base.kind, 0) / _sizes(base) - 1).max(initial=0)),
+                )
         result[np.dtype(dtype).name] = worst | {"renamed": renamed}
-        rows.append((np.dtype(dtype).name, *(worst.get(n, float("nan")) for n in ("shift", "yaw", "unit", "order")), renamed))
+        rows.append(
+            (np.dtype(dtype).name, *(worst.get(n, float("nan")) for n in ("shift", "yaw", "unit", "order")), renamed)
+        )
     table(
         "Largest relative change of radius, half-angle or edges (asked: 1e-6 in double, 1e-3 in single precision)",
         ("precision", "shift", "yaw", "unit", "order", "renamed"), rows,
