@@ -72,11 +72,10 @@ def cgal(points: np.ndarray, deviation: float) -> dict[str, Any]:
 
 
 def pyransac3d(points: np.ndarray, deviation: float) -> dict[str, Any]:
-    """Plain RANSAC, told the kind by being asked for the one with most inliers; a cuboid is three planes, so boxes are not named."""
+    """Plain RANSAC; the kind is the one with most inliers. Its cuboid is any three planes: boxes are not named, nor are cones."""
     import pyransac3d as p3
 
     random.seed(0)
-    np.random.seed(0)
     begin = time.perf_counter()
     threshold = SIGMAS * deviation
     _, plane = p3.Plane().fit(points, thresh=threshold, maxIteration=500)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.objects import capacity_for_count, upright
+from jaxfuzzy.objects import capacity_for, upright
 from jaxfuzzy.primitives import Primitive, Quadric, transform
 from jaxfuzzy.recover import holds, recover
 from jaxfuzzy.status import Status
@@ -66,7 +66,7 @@ def most_points(
     """
     turn = upright(up, np.array([0.0, 0.0, 1.0])).astype(points.dtype)
     count = len(points)
-    fill = capacity_for_count(count) - count
+    fill = capacity_for(count) - count
     padded = jnp.asarray(np.pad(points @ turn.T, ((0, fill), (0, 0)), mode="edge"))
     weight = jnp.asarray(np.pad(weights, (0, fill)), points.dtype)
     delta = jnp.asarray(np.pad(noise_distance, (0, fill), mode="edge"), points.dtype)

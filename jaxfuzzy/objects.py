@@ -142,13 +142,8 @@ def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, n
     return batch
 
 
-def capacity_for(items: Sequence[Prepared]) -> int:
-    """The smallest of a few sizes that holds every object's points; beyond them, the next power of two."""
-    return capacity_for_count(max(len(o.points) for o in items))
-
-
-def capacity_for_count(count: int) -> int:
-    """The smallest that holds so many points."""
+def capacity_for(count: int) -> int:
+    """The smallest of a few sizes that holds so many points; beyond them, the next power of two."""
     return next((c for c in CAPACITIES if c >= count), 1 << (count - 1).bit_length())
 
 

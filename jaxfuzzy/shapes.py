@@ -16,7 +16,7 @@ from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, 
 from jaxfuzzy.fitting import TOLERANCES, Fitted, assemble_batch
 from jaxfuzzy.looks import Look, Settings, look_at, unfit
 from jaxfuzzy.mostpoints import most_points
-from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches, prepared
+from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
@@ -144,8 +144,50 @@ def fit_shapes(
         TypeError: An argument of wrong kind.
     """
     array = checks.places(points)
+    label = checks.labels(labels, len(array))
+    members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    return fit_members(
+        array,
+        members,
+        noise_distance=noise_distance,
+        kinds=kinds,
+        up=up,
+        camera=camera,
+        distance=distance,
+        rule=rule,
+        weights=weights,
+    )
+
+
+def fit_members(
+    points: Float[ArrayLike, "N 3"],
+    members: Sequence[np.ndarray],
+    *,
+    noise_distance: Literal["auto"] | ArrayLike = "auto",
+    kinds: Sequence[str] = KINDS,
+    up: ArrayLike = (0.0, 1.0, 0.0),
+    camera: ArrayLike | None = None,
+    distance: Literal["ray", "geometric", "algebraic"] | None = None,
+    rule: Literal["likelihood", "gric", "paper"] = "likelihood",
+    weights: ArrayLike | None = None,
+    capacity: int = 0,
+) -> tuple[Shape, ...]:
+    """The same for sets of points that may overlap.
+
+    Args:
+        points: Points (N, 3) in metres.
+        members: Indices of the points of each set.
+        noise_distance: As in `fit_shape`; so are the others.
+        kinds: See there.
+        up: See there.
+        camera: See there.
+        distance: See there.
+        rule: See there.
+        weights: See there.
+        capacity: At least so many points an object are compiled for, so that a later call can use what an earlier one compiled.
+    """
+    array = checks.places(points)
     count = len(array)
-    label = checks.labels(labels, count)
     delta = _noise(noise_distance, count)
     kinds = _kinds(kinds)
     vertical = checks.direction(up, "up")
@@ -160,28 +202,29 @@ def fit_shapes(
     p = np.asarray(array, float)
     w = np.ones(count) if weight is None else np.asarray(weight, float)
     along_ray = distance == "ray" or (rule == "paper" and eye is not None)
-    members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
     objects = [
         prepared(p[m], w[m], None if delta is None else delta[m] / DEVIATIONS, vertical, eye, along_ray)
         if len(m)
         else None
         for m in members
     ]
-    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype)
     poor = [unfit(o) for o in objects]
+    good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
+    most = max((len(o.points) for o in good), default=1)
+    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype, capacity_for(max(most, capacity)))
     fit = [i for i, status in enumerate(poor) if not status]
-    looks = dict(zip(fit, look_at([o for o in objects if o is not None and not unfit(o)], settings), strict=True))
+    looks = dict(zip(fit, look_at(good, settings), strict=True))
     if rule != "paper":
         return _shapes(looks, poor, [len(m) for m in members], settings)
-    return tuple(
-        _by_most_points(
-            np.asarray(array)[m], w[m], None if delta is None else delta[m], looks[i], vertical, settings, distance
-        )
-        if i in looks
-        else Shape(**own, **told)
-        for i, m in enumerate(members)
-        for own, told in (_unknown(len(m), None, poor[i], settings),)
-    )
+    shapes = []
+    for i, m in enumerate(members):
+        if i in looks:
+            own = None if delta is None else delta[m]
+            shapes.append(_by_most_points(np.asarray(array)[m], w[m], own, looks[i], vertical, settings, distance))
+        else:
+            arrays, told = _unknown(len(m), None, poor[i], settings)
+            shapes.append(Shape(**jax.device_put(arrays), **told))
+    return tuple(shapes)
 
 
 def _by_most_points(
