@@ -9,15 +9,18 @@ are two.
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.fcm import fcm
 from jaxfuzzy.objects import capacity_for
+from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
 Fit = Callable[[Sequence[np.ndarray], int], tuple[Shape, ...]]
-Cut = Callable[[np.ndarray], np.ndarray]
 
 # Only neighbours are tried together: centers nearer than this share of the sum of their reaches; and so many pairs at most.
 NEAR, MOST_PAIRS = 1.0, 16
@@ -28,10 +31,12 @@ HOLDS, HOLDS_OF_ALL = 0.9, 0.7
 WHOLE, EXPLAINED, GAINED = 0.8, 0.7, 0.15
 # A part with fewer points is no object, nor one with a smaller share of its group.
 FEWEST, SMALLEST = 60, 0.1
+# A group is cut by so many of its places, with repetition where it has fewer, so that one program serves all.
+PLACES = 1024
 
 
 def by_shapes(
-    points: np.ndarray, across: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit, cut: Cut
+    points: np.ndarray, across: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit
 ) -> tuple[Segmentation, tuple[Shape, ...]]:
     """Merges and divides groups where their shapes say so.
 
@@ -41,7 +46,6 @@ def by_shapes(
         parts: Their division by places.
         shapes: The shape of each group.
         fit: Fits shapes to sets of points given by their indices, compiled for so many points an object at least.
-        cut: Divides a set of points by places into two: labels 0, 1, and -1 for outliers.
 
     Returns:
         The division and the shapes that came of it; the same records where nothing changed.
@@ -51,7 +55,7 @@ def by_shapes(
     largest = max(map(len, members), default=1)
     flat = points @ across.T
     joined = _joined(points, flat, members, shapes, fit, largest)
-    divided = _divided(members, shapes, {i for pair in joined for i in pair}, fit, cut, largest)
+    divided = _divided(points, flat, members, shapes, {i for pair in joined for i in pair}, fit, largest)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []
@@ -118,7 +122,7 @@ def _whole(
     every = np.sort(np.concatenate([members[k] for k in pair]))
     if len(own) == len(every) or shape.primitive is None:
         return own, shape
-    inliers = np.asarray(shape.primitive.distance(points[every])) <= float(shape.noise_distance)
+    inliers = _away(shape, points[every]) <= float(shape.noise_distance)
     inliers[np.isin(every, own)] = np.asarray(shape.inliers)
     return every, dataclasses.replace(shape, inliers=jnp.asarray(inliers))
 
@@ -128,27 +132,65 @@ def _thinned(own: np.ndarray, most: int) -> np.ndarray:
 
 
 def _divided(
-    members: Sequence[np.ndarray], shapes: Sequence[Shape], taken: set[int], fit: Fit, cut: Cut, largest: int
+    points: np.ndarray,
+    flat: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    taken: set[int],
+    fit: Fit,
+    largest: int,
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups that two surfaces hold much better than one, and these."""
-    pieces: dict[int, list[np.ndarray]] = {}
-    for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
-        if k in taken or len(own) < 2 * FEWEST or _held(shape) >= WHOLE * len(own):
-            continue
-        halves = cut(own)
-        two = [own[halves == side] for side in (0, 1)]
-        if min(map(len, two)) >= max(FEWEST, SMALLEST * len(own)):
-            pieces[k] = two
-    tried = [piece for two in pieces.values() for piece in two]
-    found = iter(fit(tried, largest) if tried else ())
+    tried = {
+        k: own[np.argsort(_side(flat[own]), kind="stable")]
+        for k, (own, shape) in enumerate(zip(members, shapes, strict=True))
+        if k not in taken and len(own) >= 2 * FEWEST and _held(shape) < WHOLE * len(own)
+    }
+    side = {k: np.sort(_side(flat[members[k]])) for k in tried}
     good: dict[int, list[tuple[np.ndarray, Shape]]] = {}
-    for k, two in pieces.items():
-        both = [(piece, next(found)) for piece in two]
-        count = sum(_held(shape) for _, shape in both)
-        named = all(shape.primitive is not None for _, shape in both)
-        if named and count >= EXPLAINED * len(members[k]) and count >= _held(shapes[k]) + GAINED * len(members[k]):
-            good[k] = both
+    # Places make the first cut, the two surfaces it gives the second.
+    for _ in range(2):
+        pieces = {k: [np.sort(own[side[k] == i]) for i in (0, 1)] for k, own in tried.items()}
+        pieces = {k: two for k, two in pieces.items() if min(map(len, two)) >= max(FEWEST, SMALLEST * len(tried[k]))}
+        sets = [piece for two in pieces.values() for piece in two]
+        found = iter(fit(sets, largest) if sets else ())
+        tried = {k: tried[k] for k in pieces}
+        for k, two in pieces.items():
+            both = [(piece, next(found)) for piece in two]
+            count = sum(_held(shape) for _, shape in both)
+            named = [shape for _, shape in both if shape.primitive is not None]
+            least = max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k]))
+            if len(named) == 2 and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
+                good[k] = both
+            if len(named) < 2:
+                tried.pop(k)
+                continue
+            away = [_away(shape, points[tried[k]]) for shape in named]
+            near = np.minimum(*away) <= max(float(shape.noise_distance) for shape in named)
+            side[k] = np.where(near, np.argmin(away, axis=0), side[k])
     return good
+
+
+def _away(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """Distance of points from a shape's bounded surface, by a program of one of a few sizes."""
+    padded = np.pad(points, ((0, capacity_for(len(points)) - len(points)), (0, 0)), mode="edge")
+    return np.asarray(_distance(shape.primitive, padded))[: len(points)]
+
+
+@jax.jit
+def _distance(primitive: Primitive, points: Array) -> Array:
+    return primitive.distance(points)
+
+
+def _side(flat: np.ndarray) -> np.ndarray:
+    """Which of two fuzzy clusters each place is in."""
+    some = flat[np.linspace(0, len(flat) - 1, PLACES).astype(int)]
+    middle = some.mean(axis=0)
+    long = np.linalg.eigh(np.cov(some.T))[1][:, -1]
+    reach = ((some - middle) @ long).std()
+    centers = np.asarray(fcm(some - middle, np.stack([-reach * long, reach * long])).centers)
+    away = np.linalg.norm((flat - middle)[:, None] - centers, axis=-1)
+    return np.argmin(away, axis=1)
 
 
 def _rebuilt(

@@ -5,7 +5,7 @@ spaces hold simpler surfaces too, so that ties are common; the simpler space is 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxfuzzy.objects import capacity_for, upright
 from jaxfuzzy.primitives import Primitive, Quadric, transform
-from jaxfuzzy.recover import holds, recover
+from jaxfuzzy.recover import recover
 from jaxfuzzy.status import Status
 from jaxfuzzy.varieties import Varieties, nfcv
 
@@ -70,7 +70,7 @@ def most_points(
     padded = jnp.asarray(np.pad(points @ turn.T, ((0, fill), (0, 0)), mode="edge"))
     weight = jnp.asarray(np.pad(weights, (0, fill)), points.dtype)
     delta = jnp.asarray(np.pad(noise_distance, (0, fill), mode="edge"), points.dtype)
-    options = {
+    options: dict[str, Any] = {
         "distance": "geometric" if geometric else "algebraic",
         "noise_distance": delta,
         "weights": weight,
@@ -88,9 +88,11 @@ def most_points(
     best = [name for name in able if counts[name] == most]
     chosen = best[0]
     status = Status(int(fits[chosen].status)) | (Status.PAPER_TIE if len(best) > 1 else Status(0))
-    kind = next((k for k in SPACES[chosen] if k in kinds and bool(holds(fits[chosen], k))), "quadric")
-    primitive = recover(fits[chosen], kind, points=padded)
-    if isinstance(primitive, Quadric):
-        kind, status = "quadric", status | Status.REFUSED
+    for kind in (k for k in SPACES[chosen] if k in kinds):
+        primitive = recover(fits[chosen], kind, points=padded)
+        if not isinstance(primitive, Quadric):
+            break
+    else:
+        status |= Status.REFUSED
     moved = transform(primitive, turn.T, np.zeros(3, points.dtype))
-    return MostPoints(kind, jax.device_get(moved), held[chosen], counts, status)
+    return MostPoints(primitive.kind, jax.device_get(moved), held[chosen], counts, status)

@@ -232,14 +232,8 @@ def _model(
             def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
                 return fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
 
-            def cut(group: np.ndarray) -> np.ndarray:
-                try:
-                    return np.asarray(segment(places[group], ks=(2,), **seen(own[group])).labels)
-                except checks.DataError:
-                    return np.full(len(group), -1)
-
             across = np.asarray(tangents(jnp.asarray(vertical)))
-            parts, shapes = by_shapes(places, across, parts, shapes, fit, cut)
+            parts, shapes = by_shapes(places, across, parts, shapes, fit)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,

@@ -66,7 +66,7 @@ def test_two_parts_of_one_ball_are_merged_and_a_stranger_is_not():
     parts = divided(points, np.array([0, 1, 2]))
     fit = fitted_to(points, [Sphere(jnp.array([0, 0, 1.0]), jnp.asarray(0.15)), Sphere(jnp.array([0.6, 0, 1.0]), 0.05)])
     members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)]
-    merged, shapes = by_shapes(points, ACROSS, parts, fit(members, 0), fit, lambda own: np.full(len(own), -1))
+    merged, shapes = by_shapes(points, ACROSS, parts, fit(members, 0), fit)
     assert merged.k == len(shapes) == 2
     labels = np.asarray(merged.labels)
     assert len(set(labels[: len(cut)]) - {-1}) == 1
@@ -82,15 +82,13 @@ def test_two_balls_that_touch_are_told_apart():
     spheres = [Sphere(jnp.array([x, 0, 1.0]), jnp.asarray(0.1)) for x in (0.0, 0.2)]
     fit = fitted_to(points, spheres)
     one = fit([np.flatnonzero(np.asarray(parts.labels) == 0)], 0)
-    apart, shapes = by_shapes(
-        points, ACROSS, parts, one, fit, lambda own: (points[own][:, 0] > 0.1).astype(int)
-    )
+    apart, shapes = by_shapes(points, ACROSS, parts, one, fit)
     assert apart.k == len(shapes) == 2
     labels = np.asarray(apart.labels)
     np.testing.assert_array_equal(hardened(apart), labels)
     assert {shape.kind for shape in shapes} == {"sphere"}
-    # A cut that helps nothing is not made: both halves of one ball lie on the same surface.
+    # A group that one surface holds stays whole.
     alone = segment(points[:300], ks=(1,))
     held = fit([np.flatnonzero(np.asarray(alone.labels) == 0)], 0)
-    same, _ = by_shapes(points[:300], ACROSS, alone, held, fit, lambda own: (points[own][:, 0] > 0).astype(int))
+    same, _ = by_shapes(points[:300], ACROSS, alone, held, fit)
     assert same is alone
