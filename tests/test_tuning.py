@@ -85,6 +85,21 @@ def test_another_minimiser_and_what_is_not_read():
         tune(loss, Hyper(2.5, 1.0), solver=optx.NelderMead(1e-4, 1e-4))
 
 
+def test_data_may_come_with_the_loss():
+    traces = []
+
+    def loss(wanted, hyper):
+        traces.append(1)
+        return jnp.cosh(jnp.log(hyper.noise_distance / wanted))
+
+    first = tune(jax.tree_util.Partial(loss, jnp.asarray(0.2)), Hyper(2.0, 1.0))
+    traced = len(traces)
+    second = tune(jax.tree_util.Partial(loss, jnp.asarray(0.7)), Hyper(2.0, 1.0))
+    assert len(traces) == traced > 0
+    np.testing.assert_allclose(first.hyper.noise_distance, 0.2, rtol=1e-3)
+    np.testing.assert_allclose(second.hyper.noise_distance, 0.7, rtol=1e-3)
+
+
 def by_noise(f):
     return lambda hyper: f(jnp.log(hyper.noise_distance))
 
