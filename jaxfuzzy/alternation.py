@@ -280,6 +280,6 @@ def diagnose(theta: Theta, args: Args, sums: Sums, converged: Array, *, sizes: b
         alpha = jnp.exp(log_sizes_of(theta, mask))
         rounding = jnp.finfo(centers.dtype).eps
         pointlike = real & (own <= 1e3 * rounding) & (sums.mass > 0) & (tiles.spread > 0)
-        dying = real & (alpha * real.sum() < 1e-3) & ~pointlike
+        dying = real & (alpha * real.sum() < 1e-3)
         bits += [(Status.SPIKE, pointlike.any() & (real.sum() > 1)), (Status.DYING, dying.any())]
     return sum((jnp.where(condition, int(bit), 0) for bit, condition in bits), jnp.zeros((), jnp.int32))

@@ -18,6 +18,12 @@ EM_STEPS = 4
 HALF_LOG_2PI = 0.9189385332046727
 # In nats: a plane is taken unless something else is better by more than chance and small errors of the model make it.
 PLANE_BONUS = 20.0
+# Radius in units of an object's spread from which on its surface is flat over the object: an arc of about 45 degrees.
+FLATTEST = 3.0
+# Of the inliers of a box, so many must lie on each of its faces.
+LEAST_FACE = 0.035
+# A point is on one face alone where others are so many deviations away.
+CLEAR = 3.0
 
 
 class Mixture(NamedTuple):
@@ -95,6 +101,8 @@ def cone_tapers(theta: Array, own: Array, height: Array) -> Array:
 def faces_hold(theta: Array, signs: Array, part: Array, ownership: Array, background: Array, view: View) -> Array:
     """Every face of a box must hold 3.5 % of its inliers, eight points, and most of the points within its own extent.
 
+    Points that lie on another face as well, near an edge, hold nothing: any plane has such.
+
     Args:
         theta: Boxes (H, 5).
         signs: Their outward sides (H, 3).
@@ -114,15 +122,26 @@ def faces_hold(theta: Array, signs: Array, part: Array, ownership: Array, backgr
         within = within * (jnp.abs(coordinate - mean[..., None]) < 1.7 * spread[..., None])
     filled = (own * within).sum(-1) / (within.sum(-1) + 1e-9) / (1 - background)[:, None]
     inliers = ownership.sum(-1, keepdims=True) + 1e-9
-    held = (total >= 0.035 * inliers) & (total >= 8.0) & (filled >= 0.6)
+    near = (jnp.abs(_beyond(theta, view)) * view.gain < CLEAR) & (signs != 0)[..., None]
+    alone = (own * (near.sum(1, keepdims=True) - near == 0)).sum(-1)
+    held = (alone >= LEAST_FACE * inliers) & (alone >= 8.0) & (filled >= 0.6)
     return (held | (signs == 0)).all(-1)
+
+
+def _beyond(theta: Array, view: View) -> Array:
+    """How far points lie beyond each face of boxes, along the axes of these (H, 3, N)."""
+    c, s = jnp.cos(theta[:, :1]), jnp.sin(theta[:, :1])
+    x, y, z = columns(view.point)
+    return jnp.stack([c * x + s * z - theta[:, 1:2], c * z - s * x - theta[:, 2:3], y - theta[:, 3:4]], 1)
 
 
 def _picture(theta: Array, view: View) -> tuple[Array, Array]:
     """Coordinates (H, 3, N) in which the extent of each face is judged: the picture's, or without a camera its own."""
     if view.ray is not None:
         u, v, w = columns(view.ray)
-        return (u / w)[:, None], (v / w)[:, None]
+        # Padding has no ray.
+        ahead = jnp.where(w > 0, w, 1.0)
+        return (u / ahead)[:, None], (v / ahead)[:, None]
     c, s = jnp.cos(theta[:, :1]), jnp.sin(theta[:, :1])
     x, y, z = columns(view.point)
     first, second = c * x + s * z, c * z - s * x
@@ -131,4 +150,4 @@ def _picture(theta: Array, view: View) -> tuple[Array, Array]:
 
 def stout(radius: Array) -> Array:
     """A radius must be neither nothing nor so large that the surface is flat over the object."""
-    return (radius > 0.01) & (radius < 4.0)
+    return (radius > 0.01) & (radius < FLATTEST)

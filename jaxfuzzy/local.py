@@ -104,7 +104,7 @@ def typical_deviation(found: Patches) -> Array:
     return jnp.where(found.usable.any(), order[position], 0.05)
 
 
-def lean(view: View, found: Patches) -> Array:
+def lean(view: View, found: Patches, sharp: Array) -> Array:
     """How an object leans, from the normals of small windows: the rotation (3, 3) into a frame in which its axis is y.
 
     The normals of the side of a cylinder or box are square to the axis, n·(t₁, 1, t₂) = 0; those of a cone keep one angle with it,
@@ -114,7 +114,10 @@ def lean(view: View, found: Patches) -> Array:
     Args:
         view: The points.
         found: Small pieces of its surface.
+        sharp: Which of them are smooth enough to be believed (W,); the fewer, the more must a lean explain.
     """
+    believed = found.usable & sharp
+    doubt = found.usable.sum() / jnp.maximum(believed.sum(), 1)
     toward = found.middle if view.eye is None else view.eye[0] - found.middle
     normal = found.normal
     normal = normal * jnp.where((normal * toward).sum(-1, keepdims=True) < 0, -1.0, 1.0)
@@ -129,7 +132,7 @@ def lean(view: View, found: Patches) -> Array:
         ]
     )
     right = jnp.concatenate([jnp.where(flat, nx, -ny), jnp.where(flat, nz, zero)])
-    used = jnp.concatenate([one, jnp.where(flat, one, zero)]) * jnp.tile(found.usable, 2)
+    used = jnp.concatenate([one, jnp.where(flat, one, zero)]) * jnp.tile(believed, 2)
     prior = LEAN_NOISE**2 / jnp.array(LEAN_PRIORS, nx.dtype) ** 2
     scales = jnp.asarray(np.geomspace(0.3, 2 * LEAN_NOISE, 8), nx.dtype)
 
@@ -142,7 +145,7 @@ def lean(view: View, found: Patches) -> Array:
     solved = lax.fori_loop(0, len(scales), step, jnp.zeros((4, 3), nx.dtype))
     error = (solved @ rows.T - right) / scales[-1]
     cost = (used * error**2 / (1 + error**2)).sum(-1)
-    t = solved[jnp.argmin(cost + jnp.asarray(LEAN_PRICES, nx.dtype))][:2]
+    t = solved[jnp.argmin(cost + doubt * jnp.asarray(LEAN_PRICES, nx.dtype))][:2]
     size = jnp.sqrt((t**2).sum() + 1e-12)
     t = t * jnp.where((size < LEAN_LEAST) | ~jnp.isfinite(size), 0.0, jnp.minimum(jnp.arctan(size), 0.3) / size)
     return starts.rotation(-t[1], t[0])

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
-from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, capacity_for, prepared, stacked
+from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, prepared, stacked
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
@@ -40,6 +40,7 @@ class Settings(NamedTuple):
     along_ray: bool
     camera: np.ndarray | None
     dtype: Any
+    capacity: int
 
 
 class Look(NamedTuple):
@@ -106,10 +107,9 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
     if not items:
         return []
     allowed = np.array([k in settings.kinds for k in KINDS])
-    capacity = capacity_for(items)
 
     def fit(batch: Sequence[Prepared]) -> list[Fitted]:
-        padded = stacked(batch, capacity, settings.dtype)
+        padded = stacked(batch, settings.capacity, settings.dtype)
         fitted = jax.device_get(fit_batch(padded, allowed, np.asarray(settings.gric), settings.along_ray))
         return [jax.tree.map(lambda a, i=i: a[i], fitted) for i in range(len(batch))]
 

@@ -77,7 +77,7 @@ def prepared(
     middle = share @ p
     if camera is not None and (camera - middle) @ up < 0:
         up = -up
-    turn = _upright(up, np.zeros(3) if camera is None else middle - camera)
+    turn = upright(up, np.zeros(3) if camera is None else middle - camera)
     offset = (p - middle) @ turn.T
     scatter = (offset * share[:, None]).T @ offset
     unit = float(np.sqrt(np.trace(scatter)))
@@ -111,7 +111,7 @@ def prepared(
     )
 
 
-def _upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
+def upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """The rotation (3, 3) that makes `up` y and, as far as that allows, `forward` z."""
     level = forward - up * (up @ forward)
     if np.linalg.norm(level) <= 1e-6 * np.linalg.norm(forward):
@@ -142,10 +142,9 @@ def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, n
     return batch
 
 
-def capacity_for(items: Sequence[Prepared]) -> int:
-    """The smallest of a few sizes that holds every object's points; beyond them, the next power of two."""
-    most = max(len(o.points) for o in items)
-    return next((c for c in CAPACITIES if c >= most), 1 << (most - 1).bit_length())
+def capacity_for(count: int) -> int:
+    """The smallest of a few sizes that holds so many points; beyond them, the next power of two."""
+    return next((c for c in CAPACITIES if c >= count), 1 << (count - 1).bit_length())
 
 
 def batches(items: Sequence[Any]) -> list[Sequence[Any]]:

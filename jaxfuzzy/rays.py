@@ -93,6 +93,12 @@ def taken(view: View, count: int) -> View:
     return view._replace(point=view.point[..., :count], ray=ray, gain=view.gain[:count], mask=view.mask[:count])
 
 
+def picked(view: View, index: Array) -> View:
+    """Some points of a view."""
+    ray = None if view.ray is None else view.ray[..., index]
+    return view._replace(point=view.point[..., index], ray=ray, gain=view.gain[index], mask=view.mask[index])
+
+
 def columns(vectors: Array) -> tuple[Array, Array, Array]:
     """Three coordinates (G, N) of vectors (G, 3, N)."""
     return vectors[:, 0], vectors[:, 1], vectors[:, 2]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.ground import fit_ground, foreground
+from jaxfuzzy.groups import by_shapes
+from jaxfuzzy.linalg import tangents
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.segment import Segmentation, segment
-from jaxfuzzy.shapes import Shape, fit_shapes
+from jaxfuzzy.shapes import Shape, fit_members, fit_shapes
 from jaxfuzzy.stereo import reconstruct
 
 # Noise distance in standard deviations of a point along its viewing ray: farther points rather belong to noise.
@@ -224,6 +226,14 @@ def _model(
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, **seen(own), **picked)
+        if segment_rule == "robust" and "ks" not in options:
+            places = np.asarray(points[own])
+
+            def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
+                return fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
+
+            across = np.asarray(tangents(jnp.asarray(vertical)))
+            parts, shapes = by_shapes(places, across, parts, shapes, fit)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,

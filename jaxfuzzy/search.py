@@ -14,7 +14,7 @@ from jaxfuzzy import choice, local, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.candidates import Candidates, Counts, descend, look, meet
 from jaxfuzzy.finalists import finalists
-from jaxfuzzy.rays import View, taken, turned
+from jaxfuzzy.rays import View, picked, taken, turned
 from jaxfuzzy.screening import screened
 
 KINDS = ("plane", "box", "cylinder", "cone", "sphere")
@@ -24,6 +24,8 @@ COARSE = tuple(np.geomspace(4.0, 2.5, 6))
 FINE = tuple(np.geomspace(3.0, 2.5, 4))
 # A noise scale beyond explains nothing better; its lower end keeps the mixture from settling on a few points.
 SCALES = (0.35, 2.5)
+# Deviation of a piece of surface over that of the points from which on its normal is not believed.
+ROUGH = 2.5
 # Of the spread of an object: below lies the rounding of single precision.
 LEAST_DEVIATION = 2e-5
 
@@ -66,15 +68,21 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: A
         given: Whether the deviation of the points is known.
         gric: Whether to score by GRIC in place of the likelihood.
     """
-    company = starts.dense(taken(view, FEW))
-    anchors = view.point[0, :, :FEW].T[starts.first_of(company, starts.ANCHORS)]
-    patches = local.patches(taken(view, MORE), anchors[:PATCHES])
+    more = taken(view, MORE)
+    # Screened are points that have company, so that fewer outliers are among the few.
+    among = starts.first_of(starts.dense(more), FEW)
+    few = picked(more, among)
+    company = starts.dense(few)
+    anchors = few.point[0].T[starts.first_of(company, starts.ANCHORS)]
+    patches = local.patches(more, anchors[:PATCHES])
     typical = jnp.maximum(local.typical_deviation(patches), LEAST_DEVIATION)
     deviation = jnp.where(given, 1.0, typical)
-    view = view._replace(gain=view.gain / deviation)
-    turn = local.lean(view, patches)
+    few, more = (v._replace(gain=v.gain / deviation) for v in (few, more))
+    # Pieces much rougher than the noise are none: among many outliers they would have any normal.
+    sharp = patches.deviation < ROUGH * deviation
+    turn = local.lean(more, patches, sharp)
     # From here to the finish in the frame in which the axis is about upright.
-    few, more = turned(taken(view, FEW), turn[None]), taken(view, MORE)
+    few = turned(few, turn[None])
     lid = starts.lid(few, patches.normal @ turn.T, patches.middle @ turn.T, patches.usable, company)
     window = starts.windows(few, anchors @ turn.T, lid.below)
     coarse, counts = screened(few, window, company)

@@ -8,13 +8,15 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import bounds, checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
 from jaxfuzzy.fitting import TOLERANCES, Fitted, assemble_batch
 from jaxfuzzy.looks import Look, Settings, look_at, unfit
-from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches, prepared
+from jaxfuzzy.mostpoints import most_points
+from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
@@ -82,9 +84,10 @@ def fit_shape(
         up: The vertical direction, near which axes are looked for; its sign may be either.
         camera: Where the points were seen from (3,), in their own frame.
         distance: "ray", along the viewing ray (the default with a camera); "geometric", orthogonal (without); "algebraic", the
-            paper's, in the embedding.
+            paper's, in the embedding (the default of, and only for, the paper's rule, which has no "ray").
         rule: "likelihood" of surface noise against background less a price per parameter; "gric", Torr's criterion; "paper", most
-            points in 3D, 4D or 6D.
+            points in 3D, 4D or 6D, see `mostpoints`: its `counts` are told, its shapes have no covariance, and the scores are
+            those of the likelihood, whose disagreement is told by the status.
         weights: Weight of each point (N,).
 
     Returns:
@@ -141,34 +144,119 @@ def fit_shapes(
         TypeError: An argument of wrong kind.
     """
     array = checks.places(points)
+    label = checks.labels(labels, len(array))
+    members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    return fit_members(
+        array,
+        members,
+        noise_distance=noise_distance,
+        kinds=kinds,
+        up=up,
+        camera=camera,
+        distance=distance,
+        rule=rule,
+        weights=weights,
+    )
+
+
+def fit_members(
+    points: Float[ArrayLike, "N 3"],
+    members: Sequence[np.ndarray],
+    *,
+    noise_distance: Literal["auto"] | ArrayLike = "auto",
+    kinds: Sequence[str] = KINDS,
+    up: ArrayLike = (0.0, 1.0, 0.0),
+    camera: ArrayLike | None = None,
+    distance: Literal["ray", "geometric", "algebraic"] | None = None,
+    rule: Literal["likelihood", "gric", "paper"] = "likelihood",
+    weights: ArrayLike | None = None,
+    capacity: int = 0,
+) -> tuple[Shape, ...]:
+    """The same for sets of points that may overlap.
+
+    Args:
+        points: Points (N, 3) in metres.
+        members: Indices of the points of each set.
+        noise_distance: As in `fit_shape`; so are the others.
+        kinds: See there.
+        up: See there.
+        camera: See there.
+        distance: See there.
+        rule: See there.
+        weights: See there.
+        capacity: At least so many points an object are compiled for, so that a later call can use what an earlier one compiled.
+    """
+    array = checks.places(points)
     count = len(array)
-    label = checks.labels(labels, count)
     delta = _noise(noise_distance, count)
     kinds = _kinds(kinds)
     vertical = checks.direction(up, "up")
     eye = None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), float)[0]
-    distance = checks.choice(
-        distance or ("geometric" if eye is None else "ray"), "distance", ("ray", "geometric", "algebraic")
-    )
     checks.choice(rule, "rule", ("likelihood", "gric", "paper"))
+    usual = "algebraic" if rule == "paper" else "geometric" if eye is None else "ray"
+    able = ("geometric", "algebraic") if rule == "paper" else ("ray", "geometric")
+    distance = checks.choice(distance or usual, f"distance with rule={rule!r}", able)
     if distance == "ray" and eye is None:
         raise ValueError("camera must be given with distance='ray', got None")
     weight = checks.weights(weights, count)
     p = np.asarray(array, float)
     w = np.ones(count) if weight is None else np.asarray(weight, float)
-    along_ray = distance == "ray"
-    members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    along_ray = distance == "ray" or (rule == "paper" and eye is not None)
     objects = [
         prepared(p[m], w[m], None if delta is None else delta[m] / DEVIATIONS, vertical, eye, along_ray)
         if len(m)
         else None
         for m in members
     ]
-    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype)
     poor = [unfit(o) for o in objects]
+    good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
+    most = max((len(o.points) for o in good), default=1)
+    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype, capacity_for(max(most, capacity)))
     fit = [i for i, status in enumerate(poor) if not status]
-    looks = dict(zip(fit, look_at([o for o in objects if o is not None and not unfit(o)], settings), strict=True))
-    return _shapes(looks, poor, [len(m) for m in members], settings)
+    looks = dict(zip(fit, look_at(good, settings), strict=True))
+    if rule != "paper":
+        return _shapes(looks, poor, [len(m) for m in members], settings)
+    shapes = []
+    for i, m in enumerate(members):
+        if i in looks:
+            own = None if delta is None else delta[m]
+            shapes.append(_by_most_points(np.asarray(array)[m], w[m], own, looks[i], vertical, settings, distance))
+        else:
+            arrays, told = _unknown(len(m), None, poor[i], settings)
+            shapes.append(Shape(**jax.device_put(arrays), **told))
+    return tuple(shapes)
+
+
+def _by_most_points(
+    points: np.ndarray,
+    weight: np.ndarray,
+    delta: np.ndarray | None,
+    look: Look,
+    up: np.ndarray,
+    settings: Settings,
+    distance: str,
+) -> Shape:
+    """The paper's answer for one object, beside the scores of ours."""
+    if delta is None:
+        delta = np.full(len(points), DEVIATIONS * look.expected * look.item.frame.unit)
+    found = most_points(points, weight, delta, up, settings.kinds, distance == "geometric")
+    scores, margin, guards = _told(look.fitted, settings.kinds)
+    ours = "unknown" if look.reason else KINDS[look.fitted.kind]
+    status = found.status | (Status.PAPER_DISAGREES if found.kind != ours else Status(0))
+    if found.kind == "plane":
+        status |= Status.MAY_BE_BOX
+    return Shape(
+        primitive=jax.device_put(found.primitive),
+        inliers=jnp.asarray(found.inliers),
+        noise_distance=jnp.asarray(np.median(delta), settings.dtype),
+        scores=scores,
+        margin=margin,
+        counts=found.counts,
+        covariance=jnp.zeros((0, 0), settings.dtype),
+        status=jnp.asarray(int(status), jnp.int32),
+        kind=found.kind,
+        guards=guards,
+    )
 
 
 def _noise(value: Any, count: int) -> np.ndarray | None:

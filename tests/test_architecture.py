@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "jaxfuzzy"
 ORDER = """
     arrays status checks linalg memberships tiles solve alternation fcm embedding varietystep varieties conditioning
     seeding validity density segment meshes primitives refine recover bodies simulate
-    objects rays bounds starts local choice candidates screening finalists search polish fitting looks shapes groups
+    objects rays bounds starts local choice candidates screening finalists search polish fitting looks mostpoints shapes groups
     files cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
     scene losses tuning sensitivity drawing plot export folder page report table estimators arguments terminal cli __init__
 """.split()

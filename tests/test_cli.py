@@ -455,7 +455,9 @@ def test_terminals_of_other_encodings(monkeypatch):
 
 
 def environment(tmp_path):
-    return os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
+    # A cache folder named in the environment would be taken before the user's own.
+    inherited = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    return inherited | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
 
 
 def test_the_process_itself(tmp_path):

@@ -1,0 +1,205 @@
+"""From images to objects: rendered tables with exact truth, and what real photographs are taken for.
+
+    python benchmarks/scenes.py [--data FOLDER] [--only PART ...]
+
+Prints a table a question, writes every figure to benchmarks/results/scenes.json and the photographs, with what was found drawn
+over them, to benchmarks/results/scenes.jpg. Kinds and sizes of rendered tables are compared with the truth of the object that
+most of the points belong to. What a person sees at a place of a photograph stands in PLACES; nothing of it is told to the library.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from common import RESULTS, provenance, table, timings, write
+
+import jaxfuzzy as jf
+from jaxfuzzy.render import Rendered, render_pair, table_scene
+
+# folder, left, right
+PHOTOGRAPHS = {
+    "cones": ("middlebury2003_cones", "im2.png", "im6.png"),
+    "cones, full size": ("middlebury2003_cones_full", "im2.png", "im6.png"),
+    "bowling1": ("middlebury2006_bowling1_half", "view1.png", "view5.png"),
+    "art": ("middlebury2005_art", "view1.png", "view5.png"),
+    "baby1": ("middlebury2006_baby1_half", "view1.png", "view5.png"),
+    "books": ("middlebury2005_books", "view1.png", "view5.png"),
+    "recycle": ("middlebury2014_recycle_quarter", "im0.png", "im1.png"),
+    "jadeplant": ("middlebury2014_jadeplant_quarter", "im0.png", "im1.png"),
+    "adirondack": ("middlebury2014_adirondack_quarter", "im0.png", "im1.png"),
+}
+# photograph, what a person sees there, column and row, the kinds that would be right ("unknown": it is no primitive)
+PLACES = (
+    ("cones", "mask", 330, 150, ("unknown", "quadric")),
+    ("cones", "mug", 395, 320, ("cylinder",)),
+    ("cones", "green cone in front", 237, 320, ("cone",)),
+    ("cones", "green cone at the left", 120, 320, ("cone",)),
+    ("cones", "red cone at the left", 78, 260, ("cone",)),
+    ("cones", "white cone behind", 235, 120, ("cone",)),
+    ("bowling1", "ball", 250, 250, ("sphere",)),
+    ("bowling1", "pins with cloth", 70, 250, ("unknown", "quadric")),
+    ("art", "bust", 150, 110, ("unknown", "quadric")),
+    ("art", "jug", 50, 270, ("unknown", "quadric")),
+    ("art", "cone", 230, 240, ("cone",)),
+    ("art", "lying crayon", 150, 320, ("cylinder",)),
+    ("art", "cup", 385, 310, ("cylinder", "cone")),
+    ("baby1", "hat box", 300, 440, ("cylinder",)),
+    ("baby1", "doll", 300, 240, ("unknown", "quadric")),
+    ("recycle", "bin", 300, 300, ("box",)),
+    ("jadeplant", "plant", 320, 120, ("unknown", "quadric")),
+    ("jadeplant", "flower pot", 330, 350, ("cone",)),
+    ("jadeplant", "carton at the left", 110, 340, ("box", "plane")),
+)
+BALL_DIAMETER_MM = 203.7  # measured on the true disparities
+NEAR_PX = 6
+
+
+def owner_at(scene: jf.Scene, column: float, row: float, scale: float = 1.0) -> int | None:
+    """The object that most points around a place belong to."""
+    pixels, labels = np.asarray(scene.cloud.pixels_px), np.asarray(scene.segmentation.labels)
+    here = labels[(np.abs(pixels - scale * np.array([column, row])).max(axis=1) <= scale * NEAR_PX) & (labels >= 0)]
+    return int(np.bincount(here).argmax()) if len(here) else None
+
+
+def sizes_of(kind: str, primitive: Any) -> dict[str, float]:
+    """The lengths (mm) and angles (degrees) that are compared."""
+    if kind in ("sphere", "cylinder"):
+        return {"radius": 1e3 * float(primitive.radius)}
+    return {"half-angle": float(np.degrees(primitive.half_angle))} if kind == "cone" else {}
+
+
+def rendered(_: Path, seeds: int = 20) -> dict[str, Any]:
+    """Random tables of four objects, one of each kind, camera tilted by 0 to 35 degrees."""
+    rows, errors, right_kinds, right_counts = [], {"radius": [], "half-angle": []}, [], []
+    for seed in range(seeds):
+        tilt = 35 * seed / (seeds - 1)
+        picture = render_pair(table_scene(seed, tilt=np.deg2rad(tilt)), seed=seed)
+        scene = jf.model_scene(picture.left, picture.right, picture.rig)
+        found = compared(scene, picture, errors)
+        right_counts.append(scene.segmentation.k == len(picture.objects))
+        right_kinds += found.values()
+        wrong = [name for name, good in found.items() if not good]
+        rows.append((seed, tilt, scene.segmentation.k, sum(found.values()), ", ".join(wrong) or "none"))
+    table("Rendered tables, four objects each", ("seed", "tilt", "k", "kinds right", "wrong"), rows)
+    result = {
+        "scenes": seeds,
+        "count right": float(np.mean(right_counts)),
+        "kinds right": float(np.mean(right_kinds)),
+        "median relative error": {name: float(np.median(e)) for name, e in errors.items() if e},
+    }
+    print(result)
+    return result | {"rows": rows}
+
+
+def compared(scene: jf.Scene, picture: Rendered, errors: dict[str, list[float]]) -> dict[str, bool]:
+    """Whether each true object was found alone and named rightly; sizes of the right ones are added to `errors`."""
+    columns, lines = np.round(np.asarray(scene.cloud.pixels_px)).astype(int).T
+    truth, labels = picture.labels[lines, columns], np.asarray(scene.segmentation.labels)
+    owners = {i: int(np.bincount(truth[labels == i] + 1).argmax()) - 1 for i in range(scene.segmentation.k)}
+    found = {}
+    for index, primitive in enumerate(picture.objects):
+        kind = type(primitive).__name__.lower()
+        mine = [i for i, owner in owners.items() if owner == index]
+        right = len(mine) == 1 and scene.shapes[mine[0]].kind == kind
+        found[f"{kind} as {'+'.join(scene.shapes[i].kind for i in mine) or 'nothing'}"] = right
+        if right:
+            measured = sizes_of(kind, scene.shapes[mine[0]].primitive)
+            for name, value in sizes_of(kind, primitive).items():
+                errors[name].append(abs(measured[name] / value - 1))
+    return found
+
+
+def photographs(data: Path) -> dict[str, Any]:
+    """What real photographs are taken for."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(3, 3, figsize=(13, 11), layout="constrained")
+    scenes: dict[str, jf.Scene] = {}
+    results: dict[str, Any] = {}
+    for (name, (folder, left, right)), ax in zip(PHOTOGRAPHS.items(), axes.flat, strict=True):
+        rig = jf.load_rig(data / folder / "calib.txt")
+        scene = scenes[name] = jf.model_scene(data / folder / left, data / folder / right, rig)
+        jf.plot.overlay(scene.image, scene.shapes, scene.rig, ax=ax)
+        ax.set_title(name)
+        results[name] = [
+            {
+                "kind": shape.kind,
+                **{k: round(v, 2) for k, v in sizes_of(shape.kind, shape.primitive).items()},
+                "points": int(size),
+            }
+            for shape, size in zip(
+                scene.shapes, np.bincount(np.asarray(scene.segmentation.labels) + 1)[1:], strict=True
+            )
+        ]
+    RESULTS.mkdir(exist_ok=True)
+    figure.savefig(RESULTS / "scenes.jpg", dpi=90, pil_kwargs={"quality": 80})
+    rows = []
+    for name, seen, column, row, kinds in PLACES:
+        owner = owner_at(scenes[name], column, row)
+        kind = "nothing" if owner is None else scenes[name].shapes[owner].kind
+        rows.append((name, seen, kind, "yes" if kind in kinds else "no"))
+    table("What a person sees and what it is named", ("photograph", "seen", "named", "right"), rows)
+    full = [shape for shape in scenes["cones, full size"].shapes if shape.kind == "cone"]
+    angles = sorted(round(float(np.degrees(shape.primitive.half_angle)), 1) for shape in full)
+    print(
+        f"cones, full size: {len(full)} cones, half-angles {angles}, {sum(16 <= a <= 24 for a in angles)} within 16-24"
+    )
+    ball = owner_at(scenes["bowling1"], 250, 250)
+    shape = None if ball is None else scenes["bowling1"].shapes[ball]
+    diameter = 2 * sizes_of("sphere", shape.primitive)["radius"] if shape and shape.kind == "sphere" else None
+    print(f"bowling1: diameter {diameter} mm, truth {BALL_DIAMETER_MM} mm")
+    return {
+        "named": [dict(zip(("photograph", "seen", "named", "right"), row, strict=True)) for row in rows],
+        "objects": results,
+        "half-angles, full size": angles,
+        "ball diameter mm": diameter,
+    }
+
+
+def duration(data: Path) -> dict[str, Any]:
+    """Images to models, warm, beside one run of bare SGBM."""
+    import cv2
+
+    rows, result = [], {}
+    for name, disparities in (("cones", 64), ("cones, full size", 240)):
+        folder, left, right = PHOTOGRAPHS[name]
+        rig = jf.load_rig(data / folder / "calib.txt")
+        pair = [cv2.imread(str(data / folder / image)) for image in (left, right)]
+        whole = timings(lambda pair=pair, rig=rig: jf.model_scene(*pair, rig), 3)
+        matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=disparities, blockSize=5)
+        bare = timings(lambda pair=pair, matcher=matcher: matcher.compute(*pair), 5)
+        result[name] = {"seconds": whole["median"], "sgbm": bare["median"], "ratio": whole["median"] / bare["median"]}
+        rows.append((name, whole["median"], bare["median"], whole["median"] / bare["median"]))
+    table("Images to models, warm, beside one run of SGBM", ("", "seconds", "SGBM", "ratio"), rows)
+    return result
+
+
+PARTS = {"rendered": rendered, "photographs": photographs, "duration": duration}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    data = Path(__file__).parents[2] / "shared" / "data"
+    parser.add_argument(
+        "--data", type=Path, default=data, help="folder of real pairs; without it those parts are left out"
+    )
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
+    args = parser.parse_args()
+    print(provenance(), jax.default_backend())
+    results = {}
+    for name in args.only:
+        if name != "rendered" and not args.data.is_dir():
+            print(f"{name} is left out: no data at {args.data}")
+            continue
+        results[name] = PARTS[name](args.data)
+    if set(results) == set(PARTS):
+        write("scenes", results)
+
+
+if __name__ == "__main__":
+    main()

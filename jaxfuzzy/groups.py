@@ -1,0 +1,248 @@
+"""From groups to objects, by their shapes: parts of one body merged, bodies that touch told apart.
+
+Places alone cannot tell: the inner wall of a vessel stands apart from the outer one, an occluder cuts a body in two, and
+bodies that touch are one group. A joint fit can: where one surface holds nearly as many points of two groups as a surface each
+does, it needs half the parameters and they are one object; where two surfaces hold clearly more points of a group than one, they
+are two.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy.arrays import Array
+from jaxfuzzy.fcm import fcm
+from jaxfuzzy.objects import capacity_for
+from jaxfuzzy.primitives import Primitive
+from jaxfuzzy.segment import Segmentation
+from jaxfuzzy.shapes import Shape
+
+Fit = Callable[[Sequence[np.ndarray], int], tuple[Shape, ...]]
+
+# Only neighbours are tried together: centers nearer than this share of the sum of their reaches; and so many pairs at most.
+NEAR, MOST_PAIRS = 1.0, 16
+# Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
+HOLDS, HOLDS_OF_ALL = 0.9, 0.7
+# A group of which one surface holds this share is one object. Two surfaces must hold this share of the others, and this much
+# more than one does.
+WHOLE, EXPLAINED, GAINED = 0.8, 0.7, 0.15
+# A part with fewer points is no object, nor one with a smaller share of its group.
+FEWEST, SMALLEST = 60, 0.1
+# A group is cut by so many of its places, with repetition where it has fewer, so that one program serves all.
+PLACES = 1024
+
+
+def by_shapes(
+    points: np.ndarray, across: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit
+) -> tuple[Segmentation, tuple[Shape, ...]]:
+    """Merges and divides groups where their shapes say so.
+
+    Args:
+        points: Points (N, 3).
+        across: The two directions (2, 3) of the plane objects stand on.
+        parts: Their division by places.
+        shapes: The shape of each group.
+        fit: Fits shapes to sets of points given by their indices, compiled for so many points an object at least.
+
+    Returns:
+        The division and the shapes that came of it; the same records where nothing changed.
+    """
+    labels = np.asarray(parts.labels)
+    members = [np.flatnonzero(labels == k) for k in range(parts.k)]
+    largest = max(map(len, members), default=1)
+    flat = points @ across.T
+    joined = _joined(points, flat, members, shapes, fit, largest)
+    divided = _divided(points, flat, members, shapes, {i for pair in joined for i in pair}, fit, largest)
+    if not joined and not divided:
+        return parts, shapes
+    groups: list[tuple[np.ndarray, Shape, int]] = []
+    for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
+        if k in divided:
+            groups += [(piece, other, k) for piece, other in divided[k]]
+        elif not any(k == b for _, b in joined):
+            pair = next((pair for pair in joined if k == pair[0]), None)
+            groups.append((own, shape, k) if pair is None else (*joined[pair], k))
+    into = {b: a for a, b in joined}
+    return _rebuilt(points, parts, groups, into), tuple(shape for _, shape, _ in groups)
+
+
+def _held(shape: Shape) -> float:
+    return float(np.asarray(shape.inliers).sum())
+
+
+def _joined(
+    points: np.ndarray,
+    flat: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    fit: Fit,
+    largest: int,
+) -> dict[tuple[int, int], tuple[np.ndarray, Shape]]:
+    """Pairs of groups that one surface holds, and that surface; each group is in one pair at most."""
+    able = [k for k, own in enumerate(members) if len(own) >= FEWEST]
+    middle = {k: np.median(flat[members[k]], axis=0) for k in able}
+    reach = {k: np.quantile(np.linalg.norm(flat[members[k]] - middle[k], axis=1), 0.9) for k in able}
+    apart = {
+        (a, b): np.linalg.norm(middle[a] - middle[b]) / max(reach[a] + reach[b], 1e-12)
+        for a in able
+        for b in able
+        if a < b
+    }
+    pairs = sorted((p for p in apart if apart[p] < NEAR), key=apart.__getitem__)[:MOST_PAIRS]
+    # A merged group must not need a larger program than the one compiled.
+    most = capacity_for(largest)
+    both = [_thinned(np.sort(np.concatenate([members[a], members[b]])), most) for a, b in pairs]
+    good: list[tuple[float, tuple[int, int], tuple[np.ndarray, Shape]]] = []
+    for (a, b), own, shape in zip(pairs, both, fit(both, largest) if both else (), strict=True):
+        if shape.primitive is None:
+            continue
+        held = own[np.asarray(shape.inliers)]
+        shares = []
+        for k in (a, b):
+            present = np.isin(own, members[k]).sum() / len(members[k])
+            part = np.isin(held, members[k]).sum() / max(present, 1e-12)
+            alone = _held(shapes[k])
+            shares.append(part / (HOLDS * alone if alone else HOLDS_OF_ALL * len(members[k])))
+        if min(shares) >= 1:
+            good.append((min(shares), (a, b), (own, shape)))
+    chosen: dict[tuple[int, int], tuple[np.ndarray, Shape]] = {}
+    for _, pair, found in sorted(good, key=lambda g: -g[0]):
+        if not {i for p in chosen for i in p} & set(pair):
+            chosen[pair] = found
+    return {pair: _whole(points, members, pair, *found) for pair, found in chosen.items()}
+
+
+def _whole(
+    points: np.ndarray, members: Sequence[np.ndarray], pair: tuple[int, int], own: np.ndarray, shape: Shape
+) -> tuple[np.ndarray, Shape]:
+    """The same for all points of a pair, where some were left out: those count by their orthogonal distance."""
+    every = np.sort(np.concatenate([members[k] for k in pair]))
+    if len(own) == len(every) or shape.primitive is None:
+        return own, shape
+    inliers = _away(shape, points[every]) <= float(shape.noise_distance)
+    inliers[np.isin(every, own)] = np.asarray(shape.inliers)
+    return every, dataclasses.replace(shape, inliers=jnp.asarray(inliers))
+
+
+def _thinned(own: np.ndarray, most: int) -> np.ndarray:
+    return own if len(own) <= most else own[np.linspace(0, len(own) - 1, most).astype(int)]
+
+
+def _divided(
+    points: np.ndarray,
+    flat: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    taken: set[int],
+    fit: Fit,
+    largest: int,
+) -> dict[int, list[tuple[np.ndarray, Shape]]]:
+    """Groups that two surfaces hold much better than one, and these."""
+    tried = {
+        k: own[np.argsort(_side(flat[own]), kind="stable")]
+        for k, (own, shape) in enumerate(zip(members, shapes, strict=True))
+        if k not in taken and len(own) >= 2 * FEWEST and _held(shape) < WHOLE * len(own)
+    }
+    side = {k: np.sort(_side(flat[members[k]])) for k in tried}
+    good: dict[int, list[tuple[np.ndarray, Shape]]] = {}
+    # Places make the first cut, the two surfaces it gives the second.
+    for _ in range(2):
+        pieces = {k: [np.sort(own[side[k] == i]) for i in (0, 1)] for k, own in tried.items()}
+        pieces = {k: two for k, two in pieces.items() if min(map(len, two)) >= max(FEWEST, SMALLEST * len(tried[k]))}
+        sets = [piece for two in pieces.values() for piece in two]
+        found = iter(fit(sets, largest) if sets else ())
+        tried = {k: tried[k] for k in pieces}
+        for k, two in pieces.items():
+            both = [(piece, next(found)) for piece in two]
+            count = sum(_held(shape) for _, shape in both)
+            named = [shape for _, shape in both if shape.primitive is not None]
+            least = max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k]))
+            if len(named) == 2 and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
+                good[k] = both
+            if len(named) < 2:
+                tried.pop(k)
+                continue
+            away = [_away(shape, points[tried[k]]) for shape in named]
+            near = np.minimum(*away) <= max(float(shape.noise_distance) for shape in named)
+            side[k] = np.where(near, np.argmin(away, axis=0), side[k])
+    return good
+
+
+def _away(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """Distance of points from a shape's bounded surface, by a program of one of a few sizes."""
+    padded = np.pad(points, ((0, capacity_for(len(points)) - len(points)), (0, 0)), mode="edge")
+    return np.asarray(_distance(shape.primitive, padded))[: len(points)]
+
+
+@jax.jit
+def _distance(primitive: Primitive, points: Array) -> Array:
+    return primitive.distance(points)
+
+
+def _side(flat: np.ndarray) -> np.ndarray:
+    """Which of two fuzzy clusters each place is in."""
+    some = flat[np.linspace(0, len(flat) - 1, PLACES).astype(int)]
+    middle = some.mean(axis=0)
+    long = np.linalg.eigh(np.cov(some.T))[1][:, -1]
+    reach = ((some - middle) @ long).std()
+    centers = np.asarray(fcm(some - middle, np.stack([-reach * long, reach * long])).centers)
+    away = np.linalg.norm((flat - middle)[:, None] - centers, axis=-1)
+    return np.argmin(away, axis=1)
+
+
+def _rebuilt(
+    points: np.ndarray,
+    parts: Segmentation,
+    groups: Sequence[tuple[np.ndarray, Shape, int]],
+    into: dict[int, int],
+) -> Segmentation:
+    """The division into the groups that came of it; memberships of merged ones add up, those of divided ones follow the labels."""
+    u, sizes = np.asarray(parts.partition.memberships), np.asarray(parts.sizes)
+    labels = np.full(len(points), -1, np.int32)
+    for i, (own, _, _) in enumerate(groups):
+        labels[own] = i
+    columns, size, centers, spare = [], [], [], np.zeros(len(points), u.dtype)
+    for i, (own, _, k) in enumerate(groups):
+        sources = [k, *(b for b, a in into.items() if a == k)]
+        most, total = u[:, sources].max(axis=1), u[:, sources].sum(axis=1)
+        # Memberships add up for the points of a merged group; what that would give others stays where they belong.
+        column = np.where(labels == i, total, most)
+        siblings = [j for j, (_, _, other) in enumerate(groups) if other == k]
+        share = 1.0
+        if len(siblings) > 1:
+            # What has no label of its own stays with the first.
+            column = np.where(np.isin(labels, siblings), column * (labels == i), column * (i == siblings[0]))
+            share = len(own) / sum(len(groups[j][0]) for j in siblings)
+        else:
+            spare += np.where(labels == i, 0, total - most)
+        columns.append(column)
+        size.append(share * sizes[sources].sum())
+        centers.append(points[own].mean(axis=0))
+    memberships = np.stack(columns, axis=1).astype(u.dtype)
+    rows = np.flatnonzero(labels >= 0)
+    memberships[rows, labels[rows]] += spare[rows]
+    noise = np.asarray(parts.partition.noise) + np.where(labels < 0, spare, 0)
+    # Points that a cut left out belong to noise.
+    lost = (labels < 0) & (np.asarray(parts.labels) >= 0)
+    noise = np.where(lost, noise + memberships.sum(axis=1), noise).astype(noise.dtype)
+    memberships = np.where(lost[:, None], 0, memberships)
+    counts = np.array([len(own) for own, _, _ in groups], float)
+    partition = dataclasses.replace(
+        parts.partition,
+        centers=jnp.asarray(np.stack(centers), parts.partition.centers.dtype),
+        sizes=jnp.asarray(np.array(size) / np.sum(size), parts.sizes.dtype),
+        memberships=jnp.asarray(memberships),
+        noise=jnp.asarray(noise),
+        labels=jnp.asarray(labels),
+    )
+    return dataclasses.replace(
+        parts,
+        labels=partition.labels,
+        k=len(groups),
+        sizes=partition.sizes,
+        shares=jnp.asarray(counts / counts.sum(), parts.shares.dtype),
+        partition=partition,
+    )
