@@ -443,7 +443,8 @@ def picture(each: int, seed: int, **_: Any) -> dict[str, Any]:
     given[8] = simulate_object("cylinder", seed + 1, lid="open", **vessel)
     given[9] = simulate_object("torus", seed)
     figure = pyplot.figure(figsize=(15, 6.6))
-    for i, (cloud, shape) in enumerate(zip(given, named(given), strict=True)):
+    shapes = named(given)
+    for i, (cloud, shape) in enumerate(zip(given, shapes, strict=True)):
         axes = figure.add_subplot(2, 5, i + 1, projection="3d")
         inside = np.asarray(shape.inliers)
         for which, color in ((~inside, "0.6"), (inside, "tab:blue")):
@@ -452,21 +453,23 @@ def picture(each: int, seed: int, **_: Any) -> dict[str, Any]:
         if shape.primitive is not None:
             vertices, faces = map(np.asarray, shape.primitive.mesh())
             skin = Poly3DCollection(vertices[faces][:, :, [0, 2, 1]], alpha=0.12, facecolor="tab:orange")
-            skin.set_edgecolor((0.8, 0.4, 0.0, 0.25))
+            skin.set_edgecolor((0.8, 0.4, 0.0, 0.12))
             axes.add_collection3d(skin)
         own = cloud.points[cloud.labels == 0]
         middle, half = (own.min(0) + own.max(0)) / 2, 0.6 * np.ptp(own, axis=0).max()
         for limit, at in ((axes.set_xlim, 0), (axes.set_ylim, 2), (axes.set_zlim, 1)):
             limit(middle[at] - half, middle[at] + half)
+        axes.set_box_aspect((1, 1, 1), zoom=1.25)
         axes.view_init(18, -75)
         axes.set_axis_off()
         share = 100 * float((cloud.labels < 0).mean())
-        axes.set_title(f"{cloud.truths[0].made}, {share:.0f} % strays\nnamed {shape.kind}", fontsize=10)
+        more = {5: " with a lid", 8: ", open"}.get(i, "")
+        axes.set_title(f"{cloud.truths[0].made}{more}, {share:.0f} % strays\nnamed {shape.kind}", fontsize=10)
     figure.tight_layout()
     path = RESULTS / "shapes.png"
     figure.savefig(path, dpi=110)
     print(f"\ndrew {path}")
-    return {"drawn": [shape.kind for shape in named(given)]}
+    return {"drawn": [shape.kind for shape in shapes]}
 
 
 PARTS: dict[str, Callable[..., dict[str, Any]]] = {

@@ -145,7 +145,7 @@ def fit_shapes(
     """
     array = checks.places(points)
     label = checks.labels(labels, len(array))
-    members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    members = [np.flatnonzero(label == k) for k in range(int(label.max()) + 1)]
     return fit_members(
         array,
         members,
