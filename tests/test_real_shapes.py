@@ -1,8 +1,6 @@
 """Real clouds whose shapes are known: a stereo cloud of a mug, depth-camera clouds of things on a table, cartons."""
 
 import numpy as np
-import pytest
-
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.scene import model_cloud
 
