@@ -1,6 +1,7 @@
-"""Real clouds whose shapes are known: a stereo cloud of a mug, depth-camera clouds of things on a table, cartons."""
+"""Real clouds whose shapes are known: a stereo cloud of a mug."""
 
 import numpy as np
+
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.scene import model_cloud
 
