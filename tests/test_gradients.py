@@ -1,5 +1,7 @@
 """Implicit derivatives of fuzzy c-means against central differences of the whole fit, in float64, corners included."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,20 +30,22 @@ def fourth_order(f, h):
     return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
 
 
-def loss_of(seeds, sizes, pieces="all"):
-    def loss(m, noise, x, w):
-        p = fcm(x, seeds, m=m, noise_distance=noise, weights=w, sizes=sizes, solver=EXACT)
-        if pieces == "centers":
-            return jnp.sum(jnp.sin(p.centers)) + p.objective / x.shape[0]
-        return (
-            jnp.sum(jnp.sin(p.centers))
-            + 3 * jnp.sum(p.sizes**2)
-            + jnp.mean(jnp.cos(3 * p.memberships))
-            + jnp.mean(p.noise**2)
-            + p.objective / x.shape[0]
-        )
+@partial(jax.jit, static_argnames=("sizes", "pieces"))
+def _loss(seeds, m, noise, x, w, *, sizes, pieces):
+    p = fcm(x, seeds, m=m, noise_distance=noise, weights=w, sizes=sizes, solver=EXACT)
+    if pieces == "centers":
+        return jnp.sum(jnp.sin(p.centers)) + p.objective / x.shape[0]
+    return (
+        jnp.sum(jnp.sin(p.centers))
+        + 3 * jnp.sum(p.sizes**2)
+        + jnp.mean(jnp.cos(3 * p.memberships))
+        + jnp.mean(p.noise**2)
+        + p.objective / x.shape[0]
+    )
 
-    return jax.jit(loss)
+
+def loss_of(seeds, sizes, pieces="all"):
+    return lambda *at: _loss(seeds, *at, sizes=sizes, pieces=pieces)
 
 
 def check(loss, m, noise, x, w, *, m_step=1e-3, places=((7, 1), (40, 0)), tolerance=1e-6):

@@ -196,7 +196,11 @@ GRADIENTS = {
 }
 
 
-@pytest.mark.parametrize(("kind", "embedding"), GRADIENTS)
+# Each compiles for a while; one of them, with every part of the way in it, is looked at every time.
+@pytest.mark.parametrize(
+    ("kind", "embedding"),
+    [pytest.param(*case, marks=[] if case[1] == "9d" else pytest.mark.slow) for case in GRADIENTS],
+)
 def test_derivatives_reach_back_to_the_noise_distance_and_the_fuzzifier(fits, kind, embedding):
     points, start = cloud(kind), np.asarray(fits[kind].pick(embedding).memberships)
 

@@ -228,7 +228,13 @@ def line_of_squares():
 CASES["repeated eigenvalues, q = 1"] = (*line_of_squares(), {"embedding": "3d", "dimension": 1}, 0.5)
 
 
-@pytest.mark.parametrize("name", CASES)
+# Each compiles for a while; the two with the most corners are looked at every time.
+EVERY_TIME = ("geometric, padded", "repeated eigenvalues, q = 1")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in EVERY_TIME else pytest.mark.slow) for name in CASES]
+)
 def test_gradients_are_central_differences(name):
     points, start, options, noise = CASES[name]
     rng = np.random.default_rng(7)
