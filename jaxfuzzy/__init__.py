@@ -7,6 +7,8 @@ from importlib.metadata import version as _version
 
 from jaxfuzzy import losses as losses
 from jaxfuzzy import plot as plot
+from jaxfuzzy.blocks import Blocks as Blocks
+from jaxfuzzy.blocks import blocks as blocks
 from jaxfuzzy.calibrate import calibrate as calibrate
 from jaxfuzzy.checks import DataError as DataError
 from jaxfuzzy.cloud import Cloud as Cloud

@@ -8,11 +8,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxfuzzy.arrays import Array, Float, Int, record
 from jaxfuzzy.memberships import log_strengths, shares
 from jaxfuzzy.status import Status
-from jaxfuzzy.tiles import Tiles, expanded_distances, offsets, squared_distances, sum_tiles
+from jaxfuzzy.tiles import Parts, Tiles, expanded_distances, offsets, squared_distances, sum_tiles
 
 # Two centers nearer to each other than this share of their own points' RMS distance count as one.
 SAME_PLACE = 1e-2
@@ -96,8 +97,25 @@ def sweep(theta: Theta, args: Args, *, powers: Powers, exact: bool, scatter: boo
         zero,
         jnp.full((), 0 if powers is square_powers else 2 * LOWEST, dtype),
     )
-    moments, scatters, objective, shift = sum_tiles(tiles, add, start)
+    moments, scatters, objective, shift = sum_tiles(tiles, add, start, _join)
     return Sums(moments[:, -1], moments[:, :dims], scatters, jnp.log(objective) + shift, shift)
+
+
+def _join(parts: Parts, sums: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    """Sums of all devices, each relative to a shift of its own, relative to the largest shift."""
+    *summed, shift = sums
+    top = parts.largest(jax.lax.stop_gradient(shift))
+    moments, scatters, objective = parts.total([value * jnp.exp(shift - top) for value in summed])
+    return moments, scatters, objective, top
+
+
+def merged(blocks: list[Sums]) -> Sums:
+    """Sums of several blocks of points, added on the host in double precision."""
+    each = [jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), block) for block in blocks]
+    top = max(float(one.shift) for one in each)
+    total = lambda name: sum(getattr(one, name) * np.exp(one.shift - top) for one in each)
+    log_objective = np.logaddexp.reduce([np.asarray(one.log_objective) for one in each])
+    return Sums(total("mass"), total("moment"), total("scatter"), log_objective, np.float64(top))  # type: ignore[arg-type]
 
 
 def smooth_powers(
@@ -158,7 +176,11 @@ def square_powers(
 def step(theta: Theta, args: Args, *, sizes: bool, powers: Powers, exact: bool) -> tuple[Theta, Array]:
     """One round of alternating optimisation (eqs. 9, 10, 11) and the objective where it started from."""
     _, m, _, mask = args
-    sums = sweep(theta, args, powers=powers, exact=exact, scatter=sizes)
+    return advance(theta, sweep(theta, args, powers=powers, exact=exact, scatter=sizes), m, mask, sizes=sizes)
+
+
+def advance(theta: Theta, sums: Sums, m: Array, mask: Array | None, *, sizes: bool) -> tuple[Theta, Array]:
+    """What the sums over all points make of the prototypes, and the objective where they started from."""
     filled = sums.mass > 0
     mass = jnp.where(filled, sums.mass, 1)
     centers = jnp.where(filled[:, None], sums.moment / mass[:, None], theta["centers"])
@@ -241,23 +263,50 @@ def step_jacobian(theta: Theta, args: Args, *, sizes: bool) -> Float[Array, "p p
 
 def diagnose(theta: Theta, args: Args, sums: Sums, converged: Array, *, sizes: bool) -> Int[Array, ""]:
     """Every reason to mistrust a fit, found in one more sweep over the points."""
+    tiles, m, _, mask = args
+    spread = unit_scatter(theta, args, sums.shift)
+    return judge(theta, sums, spread, m, mask, tiles, converged, sizes=sizes)
+
+
+def unit_scatter(theta: Theta, args: Args, shift: Array) -> Float[Array, "K D D"]:
+    """Sum of w u^m times the products of the directions from each center, relative to exp(shift)."""
     tiles, m, squared_noise, mask = jax.lax.stop_gradient(args)
-    theta, sums = jax.lax.stop_gradient((theta, sums))
+    theta, shift = jax.lax.stop_gradient((theta, shift))
     centers, strengths = theta["centers"], strengths_of(theta, mask)
     clusters, dims = centers.shape
-    real = jnp.ones(clusters, bool) if mask is None else mask
 
     def add(total: Array, block: Array, w: Array) -> Array:
         offset = offsets(block, centers)
         apart = jnp.square(offset).sum(axis=1)
         part = shares(apart, m, strengths, squared_noise)
-        power = jnp.exp(part.log_powers(m) - sums.shift) * w
+        power = jnp.exp(part.log_powers(m) - shift) * w
         unit = power / jnp.where(apart > 0, apart, 1)
         return total + jnp.einsum("kn,kan,kbn->kab", unit, offset, offset)
 
-    spread = sum_tiles(tiles, add, jnp.zeros((clusters, dims, dims), centers.dtype))
+    return sum_tiles(tiles, add, jnp.zeros((clusters, dims, dims), centers.dtype))
+
+
+def judge(
+    theta: Theta,
+    sums: Sums,
+    units: Float[Array, "K D D"],
+    m: Array,
+    mask: Array | None,
+    tiles: Tiles,
+    converged: Array,
+    *,
+    sizes: bool,
+) -> Int[Array, ""]:
+    """Every reason to mistrust a fit, from sums over all points: those of `sweep`, and `units`, those of `unit_scatter`.
+
+    Of `tiles` only the extent, the scale and the number of points with weight are read, so that those of a block will do.
+    """
+    theta, sums, units, m, tiles = jax.lax.stop_gradient((theta, sums, units, m, tiles))
+    centers = theta["centers"]
+    clusters = centers.shape[0]
+    real = jnp.ones(clusters, bool) if mask is None else mask
     mass = jnp.where(sums.mass > 0, sums.mass, 1)
-    elongation = jnp.linalg.eigvalsh(spread / mass[:, None, None])[:, -1]
+    elongation = jnp.linalg.eigvalsh(units / mass[:, None, None])[:, -1]
     own = sums.scatter / mass
     apart = jnp.square(centers[:, None] - centers[None]).sum(axis=-1)
     close = apart <= SAME_PLACE**2 * jnp.maximum(jnp.minimum(own[:, None], own[None]), jnp.finfo(own.dtype).eps ** 2)
@@ -266,14 +315,15 @@ def diagnose(theta: Theta, args: Args, sums: Sums, converged: Array, *, sizes: b
     stable = elongation <= (m - 1) / (2 * m) * (1 + 1e-3)
     merged, parted = twins.any(axis=1) & stable, twins.any(axis=1) & ~stable
     one_place = (twins | ~real[None] | ~real[:, None] | jnp.eye(clusters, dtype=bool)).all() & (real.sum() > 1)
-    finite = jnp.isfinite(centers).all() & jnp.isfinite(sums.log_objective) | (sums.log_objective == -jnp.inf)
+    representable = jnp.isfinite(jnp.exp(sums.log_objective + 2 * jnp.log(tiles.scale)))
+    finite = representable & jnp.isfinite(centers).all()
     bits = [
         (Status.NOT_CONVERGED, ~converged),
         (Status.NOT_FINITE, ~finite),
         (Status.COLLAPSED, one_place & merged.any() & (tiles.spread > 0)),
         (Status.MERGED, merged.any() & ~one_place),
         (Status.UNSTABLE, parted.any() & (tiles.spread > 0)),
-        (Status.TOO_FEW_POINTS, (tiles.weights > 0).sum() < real.sum()),
+        (Status.TOO_FEW_POINTS, tiles.present < real.sum()),
         (Status.DEGENERATE, tiles.spread <= 0),
     ]
     if sizes:

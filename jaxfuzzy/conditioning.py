@@ -58,7 +58,7 @@ def conditioning(
             ones,
             geometric=fit.distance == "geometric" and across == 1,
         )
-        theta = prototypes(moments(ones * one.memberships.T**task.m, task), task)
+        theta = prototypes(moments(ones * one.memberships.T**task.m, task), task.across)
         found.append(_smallest(variety_jacobian(theta, task)))
     return found[0] if isinstance(fit.embedding, str) else jnp.stack(found)
 

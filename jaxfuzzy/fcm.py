@@ -10,12 +10,17 @@ from typing import Any, Literal
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxfuzzy import checks
 from jaxfuzzy.alternation import (
+    Sums,
     Theta,
+    advance,
     diagnose,
+    judge,
     log_sizes_of,
+    merged,
     short_powers,
     smooth_powers,
     square_powers,
@@ -23,12 +28,14 @@ from jaxfuzzy.alternation import (
     step_jacobian,
     strengths_of,
     sweep,
+    unit_scatter,
 )
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, is_concrete, record, static
+from jaxfuzzy.blocks import Blocks, fingerprint
 from jaxfuzzy.memberships import shares
-from jaxfuzzy.solve import Effort, Solver, fixed_point
+from jaxfuzzy.solve import Effort, Solver, fixed_point, fixed_point_outside
 from jaxfuzzy.status import Status
-from jaxfuzzy.tiles import Tiles, squared_distances, tile_points
+from jaxfuzzy.tiles import Parts, Tiles, map_tiles, squared_distances, sum_tiles, tile_points
 
 
 @record
@@ -86,7 +93,7 @@ class NoiseRule:
 
 
 def fcm(
-    points: ArrayLike,
+    points: ArrayLike | Blocks,
     seeds: ArrayLike,
     *,
     m: Scalar = 2.0,
@@ -105,7 +112,8 @@ def fcm(
     The sizes alpha are not shares of points: alpha_i goes with S_i^(1/m), S_i the cluster's sum of u^m times squared distance.
 
     Args:
-        points: Points (N, D), any unit.
+        points: Points (N, D), any unit; or `blocks` of them where they do not fit into memory, which needs `memberships=False` and
+            has neither derivatives nor a `NoiseRule`.
         seeds: Centers to start from (K, D), K at most N.
         m: Fuzzifier, above 1.
         sizes: Whether to learn the sizes (eq. 11); otherwise all are 1/K.
@@ -122,16 +130,24 @@ def fcm(
         ValueError: An argument out of range, shapes that do not agree, non-finite points.
         TypeError: Points, seeds or weights that are not real numbers.
     """
-    points = checks.points(points)
-    seeds = checks.points(seeds, "seeds", dims=points.shape[1])
-    checks.integer(
-        seeds.shape[0], "number of seeds", at_least=1, at_most=points.shape[0], why=" (the number of points)"
-    )
     checks.fuzzifier(m)
+    square = is_concrete(m) and float(m) == 2
+    if isinstance(points, Blocks):
+        if memberships:
+            raise ValueError(
+                "memberships must be False for blocks: ask `jaxfuzzy.memberships` for those of one at a time"
+            )
+        if isinstance(noise_distance, NoiseRule):
+            raise ValueError("noise_distance must be a number or None for blocks, got a NoiseRule")
+        checks.noise_distance(noise_distance)
+        return _fit_blocks(points, seeds, m, noise_distance, weights, solver, sizes=bool(sizes), square=square)
+    points = checks.points(points)
+    seeds = _checked_seeds(seeds, points.shape)
     weights = checks.weights(weights, points.shape[0])
     rule = noise_distance if isinstance(noise_distance, NoiseRule) else None
     given = None if rule else checks.noise_distance(noise_distance)
     dtype = jnp.result_type(points, seeds)
+    parts = Parts.of(points, solver.mesh)
     points, seeds = points.astype(dtype), seeds.astype(dtype)
     as_type = partial(jnp.asarray, dtype=dtype)
     return _fit(
@@ -144,12 +160,19 @@ def fcm(
         mask=None,
         rule=rule,
         sizes=bool(sizes),
-        square=is_concrete(m) and float(m) == 2,
+        square=square,
         memberships=bool(memberships),
+        parts=parts,
     )
 
 
-_STATIC = ("rule", "sizes", "square", "memberships")
+def _checked_seeds(seeds: ArrayLike, shape: tuple[int, ...]) -> Array:
+    seeds = checks.points(seeds, "seeds", dims=shape[1])
+    checks.integer(seeds.shape[0], "number of seeds", at_least=1, at_most=shape[0], why=" (the number of points)")
+    return seeds
+
+
+_STATIC = ("rule", "sizes", "square", "memberships", "parts")
 
 
 @partial(jax.jit, static_argnames=_STATIC)
@@ -166,24 +189,25 @@ def _fit(
     sizes: bool,
     square: bool,
     memberships: bool,
+    parts: Parts | None = None,
 ) -> Partition:
     """The compiled fit; `mask` says which of the seeds are real, the others being pads of a batch over k."""
     chex.assert_rank([points, seeds], 2)
     chex.assert_equal_shape_suffix([points, seeds], 1)
-    count, (clusters, _) = points.shape[0], seeds.shape
-    tiles = tile_points(points, weights, clusters)
+    clusters = seeds.shape[0]
+    tiles = tile_points(points, weights, clusters, parts)
     start = {"centers": (jax.lax.stop_gradient(seeds) - tiles.mean) / tiles.scale}
     if sizes:
         real = jnp.ones(clusters, bool) if mask is None else mask
         start["log_sizes"] = jnp.where(real, -jnp.log(real.sum().astype(points.dtype)), 0)
     # Static flags are bound here; what is traced goes through the arguments.
     powers = square_powers if square else short_powers
-    short = partial(step, sizes=sizes, powers=powers, exact=tiles.blocks.shape[0] == 1)
+    short = partial(step, sizes=sizes, powers=powers, exact=parts is None and tiles.blocks.shape[0] == 1)
     smooth = partial(step, sizes=sizes, powers=smooth_powers, exact=True)
     solve = partial(fixed_point, short, solver=effort, smooth_step=smooth, jacobian=partial(step_jacobian, sizes=sizes))
     if rule is not None:
         plain = solve(start, (tiles, m, None, mask))
-        noise_distance = _rule_distance(rule, tiles, plain.theta["centers"], mask)
+        noise_distance = _rule_distance(rule, tiles, weights, plain.theta["centers"], mask)
         start = plain.theta
     squared_noise = None if noise_distance is None else jnp.square(noise_distance / tiles.scale)
     args = (tiles, m, squared_noise, mask)
@@ -206,8 +230,111 @@ def _fit(
     )
     if not memberships:
         return partition
-    u, noise = _memberships(tiles, theta, m, squared_noise, mask)
-    return _with_memberships(partition, u[:count], noise[:count])
+    return _with_memberships(partition, *_memberships(tiles, theta, m, squared_noise, mask))
+
+
+def _fit_blocks(
+    points: Blocks,
+    seeds: ArrayLike,
+    m: Scalar,
+    noise_distance: Any,
+    weights: Any,
+    solver: Solver,
+    *,
+    sizes: bool,
+    square: bool,
+) -> Partition:
+    """The same fit with the sums of every sweep added up over blocks."""
+    found = points.survey(weights)
+    seeds = _checked_seeds(seeds, (found.count, found.dims))
+    dtype, clusters = jnp.result_type(found.dtype, seeds), seeds.shape[0]
+    as_type = partial(jnp.asarray, dtype=dtype)
+    mean, spread, fuzzifier = as_type(found.total.mean), as_type(found.total.spread), as_type(m)
+    scale = jnp.where(spread > 0, spread, 1)
+    squared_noise = None if noise_distance is None else jnp.square(as_type(noise_distance) / scale)
+    start: Theta = {"centers": (seeds.astype(dtype) - mean) / scale}
+    if sizes:
+        start["log_sizes"] = jnp.full(clusters, -jnp.log(jnp.asarray(clusters, dtype)))
+    parts = Parts.of(None, solver.mesh)
+
+    def sums(thetas: list[Theta], **how: Any) -> list[Sums]:
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *thetas)
+        sweep_block = partial(_sweep_block, stacked, mean, spread, fuzzifier, squared_noise, parts=parts, **how)
+        each = points.each(weights, dtype, sweep_block)
+        return [merged([jax.tree.map(lambda leaf, i=i: leaf[i], one) for one in each]) for i in range(len(thetas))]
+
+    def one_round(thetas: list[Theta]) -> tuple[list[Theta], list[Array]]:
+        found = sums(thetas, powers=square_powers if square else short_powers, exact=False, scatter=sizes)
+        ahead = [
+            _advance(theta, jax.tree.map(as_type, one), fuzzifier, None, sizes=sizes)
+            for theta, one in zip(thetas, found, strict=True)
+        ]
+        return [theta for theta, _ in ahead], [merit for _, merit in ahead]
+
+    total = found.total
+    task = fingerprint(
+        "fcm", found.count, total.weight, total.mean, total.spread, seeds, m, noise_distance, sizes, solver.acceleration
+    )
+    solution = fixed_point_outside(
+        one_round, start, solver, saved=points.resume(task), after=partial(points.keep, task)
+    )
+    theta = solution.theta
+    last = jax.tree.map(as_type, sums([theta], powers=smooth_powers, exact=True, scatter=True)[0])
+    unit_block = partial(_unit_scatter_block, theta, mean, spread, fuzzifier, squared_noise, last.shift, parts=parts)
+    units = sum(np.asarray(one, np.float64) for one in points.each(weights, dtype, unit_block))
+    nothing = jnp.zeros((0, 0), dtype)
+    extent = Tiles(nothing[None], nothing, mean, scale, spread, jnp.asarray(found.present), found.count)
+    return Partition(
+        centers=mean + scale * theta["centers"],
+        sizes=jnp.exp(log_sizes_of(theta, None)),
+        memberships=jnp.zeros((0, clusters), dtype),
+        noise=jnp.zeros(0, dtype),
+        labels=jnp.zeros(0, jnp.int32),
+        objective=jnp.exp(last.log_objective + 2 * jnp.log(scale)),
+        steps=solution.steps,
+        status=judge(theta, last, as_type(units), fuzzifier, None, extent, solution.converged, sizes=sizes),
+        m=fuzzifier,
+        noise_distance=as_type(jnp.inf if noise_distance is None else noise_distance),
+        sizes_learned=sizes,
+    )
+
+
+_advance = partial(jax.jit, static_argnames=("sizes",))(advance)
+
+
+@partial(jax.jit, static_argnames=("powers", "exact", "scatter", "parts"))
+def _sweep_block(
+    thetas: Theta,
+    mean: Array,
+    spread: Array,
+    m: Array,
+    squared_noise: Array | None,
+    points: Float[Array, "n D"],
+    weights: Float[Array, " n"],
+    *,
+    parts: Parts | None,
+    **how: Any,
+) -> Sums:
+    """Sums over one block of points for several prototypes at once."""
+    tiles = tile_points(points, weights, thetas["centers"].shape[1], parts, (mean, spread))
+    return jax.vmap(lambda theta: sweep(theta, (tiles, m, squared_noise, None), **how))(thetas)
+
+
+@partial(jax.jit, static_argnames=("parts",))
+def _unit_scatter_block(
+    theta: Theta,
+    mean: Array,
+    spread: Array,
+    m: Array,
+    squared_noise: Array | None,
+    shift: Array,
+    points: Float[Array, "n D"],
+    weights: Float[Array, " n"],
+    *,
+    parts: Parts | None,
+) -> Float[Array, "K D D"]:
+    tiles = tile_points(points, weights, theta["centers"].shape[0], parts, (mean, spread))
+    return unit_scatter(theta, (tiles, m, squared_noise, None), shift)
 
 
 def _with_memberships(partition: Partition, u: Float[Array, "N K"], noise: Float[Array, " N"]) -> Partition:
@@ -231,15 +358,14 @@ def _with_memberships(partition: Partition, u: Float[Array, "N K"], noise: Float
 def _memberships(
     tiles: Tiles, theta: Theta, m: Array, squared_noise: Array | None, mask: Array | None
 ) -> tuple[Float[Array, "N K"], Float[Array, " N"]]:
-    """Memberships and noise of the tiled points, padding included, tile by tile."""
-    strengths, clusters = strengths_of(theta, mask), theta["centers"].shape[0]
+    """Memberships and noise of the tiled points, tile by tile."""
+    strengths = strengths_of(theta, mask)
 
     def one(block: Array) -> tuple[Array, Array]:
         part = shares(squared_distances(block, theta["centers"]), m, strengths, squared_noise)
         return part.memberships.T, part.noise
 
-    u, noise = jax.lax.map(jax.checkpoint(one), tiles.blocks)
-    return u.reshape(-1, clusters), noise.reshape(-1)
+    return map_tiles(tiles, one)
 
 
 @jax.jit
@@ -250,10 +376,9 @@ def _memberships_of(
     theta = {"centers": (partition.centers - tiles.mean) / tiles.scale}
     if partition.sizes_learned:
         theta["log_sizes"] = jnp.log(partition.sizes)
-    u, noise = _memberships(
+    return _memberships(
         tiles, theta, jnp.asarray(partition.m), jnp.square(partition.noise_distance / tiles.scale), None
     )
-    return u[: tiles.count], noise[: tiles.count]
 
 
 def memberships(points: ArrayLike, partition: Partition) -> Float[Array, "N K"]:
@@ -273,16 +398,23 @@ def memberships(points: ArrayLike, partition: Partition) -> Float[Array, "N K"]:
     return _memberships_of(points.astype(jnp.result_type(points, partition.centers)), partition)[0]
 
 
-def _rule_distance(rule: NoiseRule, tiles: Tiles, centers: Array, mask: Array | None) -> Array:
+def _rule_distance(rule: NoiseRule, tiles: Tiles, weights: Array | None, centers: Array, mask: Array | None) -> Array:
     """The noise distance by rule, in the input's units."""
-    apart = jax.lax.map(lambda block: squared_distances(block, centers), tiles.blocks)  # (T, K, n)
     real = jnp.ones(centers.shape[0], bool) if mask is None else mask
     if rule.name == "dave":
-        total = jnp.einsum("tkn,tn,k->", apart, tiles.weights, real.astype(apart.dtype))
+
+        def add(total: Array, block: Array, w: Array) -> Array:
+            return total + jnp.where(real[:, None], squared_distances(block, centers), 0).sum(axis=0) @ w
+
+        total = sum_tiles(tiles, add, jnp.zeros((), centers.dtype))
         return tiles.scale * jnp.sqrt(rule.value * total / (tiles.weights.sum() * real.sum()))
-    nearest = jnp.where(real[:, None], apart, jnp.inf).min(axis=1).ravel()
+
+    def one(block: Array) -> Array:
+        return jnp.where(real[:, None], squared_distances(block, centers), jnp.inf).min(axis=0)
+
+    nearest = map_tiles(tiles, one)
     order = jnp.argsort(nearest)
-    heap = jnp.cumsum(tiles.weights.ravel()[order])
+    heap = jnp.cumsum((jnp.ones_like(nearest) if weights is None else weights)[order])
     at = jnp.searchsorted(heap, rule.value * heap[-1])
     return tiles.scale * jnp.sqrt(nearest[order][at])
 

@@ -9,7 +9,8 @@ with a rank-revealing pseudo-inverse, so that a singular item (coincident center
 other items of a batch alone. Nothing raises inside a compiled function, forward or backward.
 """
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
@@ -39,6 +41,8 @@ class Solver:
             taken below 16 units of rounding. 0 is legal and takes exactly `max_steps` steps.
         acceleration: "anderson" combines the last steps and takes the outcome only where its objective is no higher than that of
             the plain step from the same point; None is plain alternating optimisation.
+        mesh: Devices to divide the points among, along all its axes. None: those the points lie on already (`jax.device_put` with
+            a `NamedSharding` of their first axis), else the default device.
 
     Raises:
         ValueError: `max_steps` below 1, `tol` negative or not finite, unknown `acceleration`.
@@ -47,6 +51,7 @@ class Solver:
     max_steps: int = 500
     tol: float = 1e-6
     acceleration: Literal["anderson"] | None = "anderson"
+    mesh: jax.sharding.Mesh | None = None
 
     def __post_init__(self) -> None:
         checks.integer(self.max_steps, "max_steps", at_least=1)
@@ -152,15 +157,11 @@ def _solve(
     args: Any,
 ) -> tuple[Array, Array, Array, Array]:
     del smooth, jacobian
-    eps = jnp.finfo(start.dtype).eps
-    # Rounding alone keeps prototypes moving by a few units, so a tolerance below that would never be met.
-    limit = jnp.where(tol > 0, jnp.maximum(tol, 16 * eps), -1.0)
-    solver = _Alternation(0.0, limit, _largest, max_steps, accelerate, descent)  # type: ignore[arg-type]
+    solver = _alternation(start, tol, max_steps, accelerate, descent)
     # The step limit is the solver's own, so that it is traced: another limit needs no other compilation.
     solution = optx.fixed_point(step, solver, start, args, has_aux=True, max_steps=None, throw=False)
-    change, y = solution.state.change, solution.state.ahead
-    converged = jnp.where(tol > 0, change <= limit, change <= 16 * eps) & jnp.isfinite(y).all()
-    return y, solution.state.steps, change, converged
+    state = solution.state
+    return state.ahead, state.steps, state.change, solver.converged(state)
 
 
 def _solve_jvp(
@@ -229,21 +230,37 @@ class _Alternation(optx.AbstractFixedPointSolver):
 
     def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
         del options, f_struct, aux_struct, tags
-        ahead, _ = fn(y, args)
+        return self.begin(y, fn(y, args)[0])
+
+    def begin(self, y: Array, ahead: Array) -> _State:
+        """The state after the first step."""
         memory = jnp.zeros((MEMORY if self.accelerate else 0, y.size), y.dtype)
         zero = jnp.zeros((), jnp.int32)
         return _State(zero + 1, ahead, self.norm(ahead - y), memory, memory, zero)
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any) -> tuple[Any, _State, Any]:
         del options, tags
-        plain = state.ahead
+        tried = self.candidates(y, state)
+        if len(tried) == 1:
+            ahead, merit = (value[None] for value in fn(tried[0], args))
+        else:
+            ahead, merit = jax.vmap(lambda z: fn(z, args))(tried)
+        return self.choose(y, state, tried, ahead, merit)
+
+    def candidates(self, y: Array, state: _State) -> Float[Array, "1_or_2 p"]:
+        """Where to step from next: the outcome of the plain step, and Anderson's combination."""
         if not self.accelerate:
-            ahead, merit = fn(plain, args)
-            return plain, _ahead(state, ahead, self.norm(ahead - plain)), merit
-        bold = _anderson(y, plain, state)
-        ahead, merit = jax.vmap(lambda z: fn(z, args))(jnp.stack([plain, bold]))
+            return state.ahead[None]
+        return jnp.stack([state.ahead, _anderson(y, state.ahead, state)])
+
+    def choose(self, y: Array, state: _State, tried: Array, ahead: Array, merit: Array) -> tuple[Array, _State, Array]:
+        """The better candidate, once one step has been taken from each."""
+        plain = tried[0]
+        if len(tried) == 1:
+            return plain, _ahead(state, ahead[0], self.norm(ahead[0] - plain)), merit[0]
+        bold = tried[1]
         if not self.descent:
-            merit = jnp.log(jnp.abs(ahead - jnp.stack([plain, bold])).max(axis=1))
+            merit = jnp.log(jnp.abs(ahead - tried).max(axis=1))
         slack = 8 * jnp.finfo(y.dtype).eps
         better = (state.known > 0) & (merit[1] <= merit[0] + slack) & jnp.isfinite(ahead[1]).all()
         # Both candidates were swept, so both teach the next combination.
@@ -255,13 +272,72 @@ class _Alternation(optx.AbstractFixedPointSolver):
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, Any]:
         del fn, y, args, options, tags
-        return (state.change <= self.atol) | (state.steps >= self.max_steps), optx.RESULTS.successful
+        return self.done(state), optx.RESULTS.successful
+
+    def done(self, state: _State) -> Bool[Array, ""]:
+        """Whether to stop."""
+        return (state.change <= self.atol) | (state.steps >= self.max_steps)
+
+    def converged(self, state: _State) -> Bool[Array, ""]:
+        """Whether the prototypes stand still; with a tolerance of 0, to rounding."""
+        limit = jnp.where(self.atol >= 0, self.atol, 16 * jnp.finfo(state.ahead.dtype).eps)
+        return (state.change <= limit) & jnp.isfinite(state.ahead).all()
 
     def postprocess(
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: optx.RESULTS
     ) -> tuple[Any, Any, dict[str, Any]]:
         del fn, args, options, state, tags, result
         return y, aux, {}
+
+
+def _alternation(start: Array, tol: Array, max_steps: Array, accelerate: bool, descent: bool) -> _Alternation:
+    # Rounding alone keeps prototypes moving by a few units, so a tolerance below that would never be met.
+    limit = jnp.where(tol > 0, jnp.maximum(tol, 16 * jnp.finfo(start.dtype).eps), -1.0)
+    return _Alternation(0.0, limit, _largest, max_steps, accelerate, descent)  # type: ignore[arg-type]
+
+
+def fixed_point_outside(
+    step: Callable[[list[Any]], tuple[list[Any], Sequence[Any]]],
+    start: Any,
+    solver: Solver,
+    *,
+    descent: bool = True,
+    saved: Mapping[str, Any] | None = None,
+    after: Callable[[dict[str, Any]], None] = lambda state: None,
+) -> FixedPoint:
+    """The same iteration as `fixed_point`, for a step that cannot be compiled because it reads its points from elsewhere.
+
+    Args:
+        step: From a list of prototypes to those one step on, and the merit of each.
+        start: Prototypes to start from.
+        solver: Tolerance, step limit, acceleration.
+        descent: As in `fixed_point`.
+        saved: What `after` was given last, to go on from there.
+        after: Called after every step with everything that is needed to go on.
+    """
+    flat, unravel = ravel_pytree(start)
+    effort = solver.traced(flat.dtype)
+    loop = _alternation(flat, effort.tol, effort.max_steps, effort.accelerate, descent)
+    names = [field.name for field in dataclasses.fields(_State)]  # type: ignore[arg-type]
+
+    def steps(tried: Array) -> tuple[Array, Array]:
+        ahead, merits = step([unravel(y) for y in tried])
+        return jnp.stack([ravel_pytree(one)[0].astype(flat.dtype) for one in ahead]), jnp.asarray(merits, flat.dtype)
+
+    def keep(y: Array, state: _State) -> None:
+        after({"y": np.asarray(y)} | {name: np.asarray(getattr(state, name)) for name in names})
+
+    if saved is None:
+        y, state = flat, loop.begin(flat, steps(flat[None])[0][0])
+        keep(y, state)
+    else:
+        y, state = jnp.asarray(saved["y"]), _State(*(jnp.asarray(saved[name]) for name in names))
+    candidates, choose = eqx.filter_jit(_Alternation.candidates), eqx.filter_jit(_Alternation.choose)
+    while not bool(loop.done(state)):
+        tried = candidates(loop, y, state)
+        y, state, _ = choose(loop, y, state, tried, *steps(tried))
+        keep(y, state)
+    return FixedPoint(unravel(state.ahead), state.steps, state.change, loop.converged(state))
 
 
 def _largest(change: Array) -> Array:

@@ -2,21 +2,84 @@
 
 Points are centered, scaled to RMS 1 and stored tile by tile as (tiles, D, n), so that distances and sums are small matrix products
 that stay in the processor's cache. Padding points have weight 0.
+
+Over several devices each holds its own tiles and sweeps them alone; only the sums travel, by one all-reduce a sweep.
 """
 
+import math
 from collections.abc import Callable
-from typing import TypeVar
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from jaxfuzzy.arrays import Array, Float, record, static
+from jaxfuzzy.arrays import Array, Float, Int, record, static
 
 Sums = TypeVar("Sums")
 
 # Values a tile's distances may hold: with 4-byte floats 128 KiB, which stays in a core's second-level cache.
 TILE_VALUES = 32_768
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The devices among which points are divided.
+
+    Attributes:
+        mesh: The devices.
+        axes: Names of the mesh's axes along which points are divided; along others they are repeated.
+    """
+
+    mesh: Mesh
+    axes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, points: Any, mesh: Mesh | None) -> "Parts | None":
+        """Along all axes of a mesh that was asked for, or as an array's first axis is divided already; None: one device."""
+        axes: Any = None
+        if mesh is not None:
+            axes = mesh.axis_names
+        elif isinstance(points, jax.Array) and not isinstance(points, jax.core.Tracer):
+            kind = points.sharding
+            if isinstance(kind, NamedSharding) and len(kind.spec) and kind.spec[0] is not None:
+                mesh, axes = kind.mesh, kind.spec[0]
+        if mesh is None or mesh.size == 1:
+            return None
+        # The mesh of devices alone: whether its owner wants shardings in types is no business of the sums.
+        plain = Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
+        return cls(plain, (axes,) if isinstance(axes, str) else tuple(axes))
+
+    @property
+    def count(self) -> int:
+        """Number of parts."""
+        sizes = dict(self.mesh.shape)
+        return math.prod(sizes[name] for name in self.axes)
+
+    def split(self, array: Array) -> Array:
+        """An array with its first axis divided among the devices, zeros added where it does not come out even."""
+        array = jnp.pad(array, [(0, -array.shape[0] % self.count)] + [(0, 0)] * (array.ndim - 1))
+        place = NamedSharding(self.mesh, PartitionSpec(self.axes))
+        if isinstance(array, jax.core.Tracer):
+            return lax.with_sharding_constraint(array, place)
+        return jax.device_put(array, place)
+
+    def each(self, do: Callable[..., Any], *arrays: Array, whole: bool = False) -> Any:
+        """Does something to each part of some arrays; `whole` where the outcome is the same for all."""
+        divided = PartitionSpec(self.axes)
+        out = PartitionSpec() if whole else divided
+        return jax.shard_map(do, mesh=self.mesh, in_specs=divided, out_specs=out)(*arrays)
+
+    def total(self, sums: Any) -> Any:
+        """Adds up what each part has summed; to be called inside `each`."""
+        return lax.psum(sums, self.axes)
+
+    def largest(self, value: Array) -> Array:
+        """The largest value of any part; to be called inside `each`."""
+        return lax.pmax(value, self.axes)
 
 
 @record
@@ -29,7 +92,9 @@ class Tiles:
         mean: What was taken off, in the input's units.
         scale: What was divided by; 1 where all points are equal.
         spread: RMS distance from the mean in the input's units, 0 where all points are equal.
+        present: How many points have weight.
         count: Number of points N.
+        parts: The devices that hold the tiles; None: one.
     """
 
     blocks: Float[Array, "T D_2 n"]
@@ -37,14 +102,30 @@ class Tiles:
     mean: Float[Array, " D"]
     scale: Float[Array, ""]
     spread: Float[Array, ""]
+    present: Int[Array, ""]
     count: int = static()
+    parts: Parts | None = static(default=None)
 
 
-def tile_points(points: Float[Array, "N D"], weights: Float[Array, " N"] | None, clusters: int) -> Tiles:
-    """Centers, scales and tiles points for sweeps over a number of clusters."""
-    count, dims = points.shape
+def tile_points(
+    points: Float[Array, "N D"],
+    weights: Float[Array, " N"] | None,
+    clusters: int,
+    parts: Parts | None = None,
+    whole: tuple[Array, Array] | None = None,
+) -> Tiles:
+    """Centers, scales and tiles points for sweeps over a number of clusters.
+
+    Args:
+        points: The points.
+        weights: Their weights.
+        clusters: How many clusters will be swept.
+        parts: The devices to divide them among.
+        whole: Mean and spread where these points are but a block of all.
+    """
+    count = points.shape[0]
     # The map that is iterated commutes with shifts and scaling, so the frame itself needs no derivative.
-    mean, spread = lax.stop_gradient(frame(points, weights))
+    mean, spread = lax.stop_gradient(frame(points, weights) if whole is None else whole)
     scale = jnp.where(spread > 0, spread, 1)
     inside = (points - mean) / scale
     if weights is None:
@@ -53,15 +134,26 @@ def tile_points(points: Float[Array, "N D"], weights: Float[Array, " N"] | None,
         # A point of weight 0 may hold anything finite; it must not reach the sums.
         inside = jnp.where((weights > 0)[:, None], inside, 0)
         weights = weights.astype(points.dtype)
-    rows = min(max(256, TILE_VALUES // clusters), count)
-    rows = -(-rows // 8) * 8
+    present = (weights > 0).sum()
+    own = count if parts is None else -(-count // parts.count)
+    rows = min(max(256, TILE_VALUES // clusters), own)
+    lay = partial(_lay_out, rows=-(-rows // 8) * 8)
+    if parts is None:
+        blocks, weights = lay(inside, weights)
+    else:
+        blocks, weights = parts.each(lay, parts.split(inside), parts.split(weights))
+    return Tiles(blocks, weights, mean, scale, spread, present, count, parts)
+
+
+def _lay_out(inside: Float[Array, "N D"], weights: Float[Array, " N"], rows: int) -> tuple[Array, Array]:
+    count, dims = inside.shape
     tiles = -(-count // rows)
     pad = tiles * rows - count
     inside = jnp.pad(inside, ((0, pad), (0, 0)))
     # With its squared length and a 1 beside each point, distances and sums are one matrix product each.
     design = [inside, jnp.square(inside).sum(axis=1, keepdims=True), jnp.ones_like(inside[:, :1])]
     blocks = jnp.concatenate(design, axis=1).reshape(tiles, rows, dims + 2).transpose(0, 2, 1)
-    return Tiles(blocks, jnp.pad(weights, (0, pad)).reshape(tiles, rows), mean, scale, spread, count)
+    return blocks, jnp.pad(weights, (0, pad)).reshape(tiles, rows)
 
 
 def frame(points: Float[Array, "N D"], weights: Float[Array, " N"] | None) -> tuple[Array, Array]:
@@ -82,13 +174,46 @@ def frame(points: Float[Array, "N D"], weights: Float[Array, " N"] | None) -> tu
     return origin + mean, spread
 
 
-def sum_tiles(tiles: Tiles, body: Callable[[Sums, Array, Array], Sums], start: Sums) -> Sums:
+def sum_tiles(
+    tiles: Tiles,
+    body: Callable[[Sums, Array, Array], Sums],
+    start: Sums,
+    join: Callable[[Parts, Sums], Sums] = Parts.total,
+) -> Sums:
     """Adds up over tiles: `body(sums, block (D + 2, n), weights (n,)) -> sums`, one tile in memory at a time.
 
     Going backward each tile is computed again rather than kept, so a gradient needs no N × K memory either.
+
+    Args:
+        tiles: The tiles.
+        body: Adds one tile.
+        start: Sums of nothing.
+        join: Makes one of the sums of all devices.
     """
     step = jax.checkpoint(lambda sums, tile: (body(sums, *tile), None))
-    return lax.scan(step, start, (tiles.blocks, tiles.weights))[0]
+    parts = tiles.parts
+    if parts is None:
+        return lax.scan(step, start, (tiles.blocks, tiles.weights))[0]
+
+    def part(blocks: Array, weights: Array) -> Sums:
+        begin = jax.tree.map(lambda zero: lax.pcast(zero, parts.axes, to="varying"), start)
+        return join(parts, lax.scan(step, begin, (blocks, weights))[0])
+
+    return parts.each(part, tiles.blocks, tiles.weights, whole=True)
+
+
+def map_tiles(tiles: Tiles, body: Callable[[Array], Any]) -> Any:
+    """`body` of each tile's points (D + 2, n) -> arrays (n, ...), put together for all N points."""
+    parts = tiles.parts
+
+    def some(blocks: Array) -> Any:
+        out = lax.map(jax.checkpoint(body), blocks)
+        own = tiles.count if parts is None else -(-tiles.count // parts.count)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:own], out)
+
+    if parts is None:
+        return some(tiles.blocks)
+    return jax.tree.map(lambda leaf: leaf[: tiles.count], parts.each(some, tiles.blocks))
 
 
 def offsets(block: Float[Array, "D_2 n"], centers: Float[Array, "K D"]) -> Float[Array, "K D n"]:

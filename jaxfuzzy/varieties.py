@@ -21,11 +21,15 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
-from jaxfuzzy.embedding import monomial_gradients, monomials, padded_tables, size
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar
+from jaxfuzzy.blocks import Blocks
+from jaxfuzzy.embedding import monomial_gradients, monomials, padded_tables
 from jaxfuzzy.linalg import weighted_moments, weighted_range
 from jaxfuzzy.solve import Solver, fixed_point
-from jaxfuzzy.tiles import frame
+from jaxfuzzy.tiles import Parts, frame
+from jaxfuzzy.varietyblocks import fit_blocks
+from jaxfuzzy.varietyresult import Varieties as Varieties
+from jaxfuzzy.varietyresult import unless_finite
 from jaxfuzzy.varietystep import (
     directions,
     divide_points,
@@ -40,86 +44,8 @@ from jaxfuzzy.varietystep import (
 )
 
 
-@record
-class Varieties:
-    """C linear varieties in an embedding, and the points' memberships in them.
-
-    With a tuple of embeddings every array field has a leading axis E and is padded to the largest Q.
-
-    Attributes:
-        centers: A point on each variety.
-        normals: Unit normal of each hyperplane (q = Q - 1); zeros where q < Q - 1.
-        basis: Orthonormal directions that span each variety, that of largest scatter first; no gradient is promised for them.
-        squared_distances: Squared distances, in metres squared if geometric, of the embedding if algebraic.
-        memberships: Memberships in the varieties.
-        noise: Membership in the noise cluster; zero without one.
-        labels: The variety of largest membership, -1 where noise is larger.
-        inliers: Where noise membership is not the largest.
-        objective: The objective.
-        steps: Number of steps taken.
-        status: Reasons to read this with care; see `describe`.
-        m: Fuzzifier.
-        noise_distance: Noise distance, infinite without a noise cluster.
-        origin: Mean of the points. With `unit` it makes the local frame (p - origin) / unit in which moments are kept, since
-            in the input's frame they lose digits far from its origin.
-        unit: RMS distance of the points from their mean.
-        local_centers: Centers of the embedded local points (eq. 15).
-        scatter: Their scatter about the centers (eq. 16), divided by the sum of its weights.
-        slopes: Mean of their ∇phi ∇phiᵀ under the same weights: n · scatter n / n · slopes n is a mean squared distance.
-        bounds: Lowest and highest coordinates of each variety's inliers: their 2 % and 98 % quantiles, stretched as if they
-            were spread evenly, so that one outlier moves nothing.
-        embedding: Name of the embedding, or the names.
-        distance: Which distance was used.
-    """
-
-    centers: Float[Array, "C Q"]
-    normals: Float[Array, "C Q"]
-    basis: Float[Array, "C Q q"]
-    squared_distances: Float[Array, "N C"]
-    memberships: Float[Array, "N C"]
-    noise: Float[Array, " N"]
-    labels: Int[Array, " N"]
-    inliers: Bool[Array, " N"]
-    objective: Float[Array, ""]
-    steps: Int[Array, ""]
-    status: Int[Array, ""]
-    m: Scalar
-    noise_distance: Scalar
-    origin: Float[Array, " D"]
-    unit: Float[Array, ""]
-    local_centers: Float[Array, "C Q"]
-    scatter: Float[Array, "C Q Q"]
-    slopes: Float[Array, "C Q Q"]
-    bounds: Float[Array, "C 2 D"]
-    embedding: str | tuple[str, ...] = static()
-    distance: str = static(default="geometric")
-
-    def pick(self, embedding: str) -> "Varieties":
-        """The varieties in one of several embeddings, without padding.
-
-        Raises:
-            ValueError: this embedding was not fitted.
-        """
-        names = (self.embedding,) if isinstance(self.embedding, str) else self.embedding
-        checks.choice(embedding, "embedding", names)
-        if isinstance(self.embedding, str):
-            return self
-        at, q = names.index(embedding), size(embedding, self.origin.shape[-1])
-        one = jax.tree.map(lambda leaf: leaf[at], self)
-        return replace(
-            one,
-            centers=one.centers[:, :q],
-            normals=one.normals[:, :q],
-            basis=one.basis[:, :q, : q - 1],
-            local_centers=one.local_centers[:, :q],
-            scatter=one.scatter[:, :q, :q],
-            slopes=one.slopes[:, :q, :q],
-            embedding=embedding,
-        )
-
-
 def nfcv(
-    points: ArrayLike,
+    points: ArrayLike | Blocks,
     start: ArrayLike | Varieties,
     *,
     embedding: str | Sequence[str] = "6d",
@@ -136,8 +62,10 @@ def nfcv(
     `points`, `weights`, `m` and `noise_distance`, those of the fixed point reached.
 
     Args:
-        points: Points (N, 3) in metres, or (N, D) with the embedding "linear".
-        start: Memberships (N, C) to start from, or Varieties of the same points to go on from (by their memberships).
+        points: Points (N, 3) in metres, or (N, D) with the embedding "linear"; or `blocks` of them where they do not fit into
+            memory: one embedding, one noise distance, no derivatives, and nothing that has one number a point in the result.
+        start: Memberships (N, C) to start from, or Varieties of the same points to go on from (by their memberships). Over blocks,
+            Varieties of any points, say of a sample, to go on from by their prototypes.
         embedding: A name of `jaxfuzzy.embedding`; or several, which are then fitted side by side in one compiled call.
         dimension: Dimension q of the varieties, Q - 1 where not given. Others need the algebraic distance, or an embedding
             in which both distances agree ("3d", "linear").
@@ -156,8 +84,12 @@ def nfcv(
         ValueError: An argument out of range, an unknown name, shapes that do not agree, non-finite points.
         TypeError: Points, start or weights that are not real numbers.
     """
-    points = checks.points(points)
-    count, dims = points.shape
+    if isinstance(points, Blocks):
+        found = points.survey(weights)
+        count, dims = found.count, found.dims
+    else:
+        points = checks.points(points)
+        count, dims = points.shape
     names = (embedding,) if isinstance(embedding, str) else tuple(embedding)
     if not names:
         raise ValueError("embedding must be a name or several, got none")
@@ -181,10 +113,27 @@ def nfcv(
         raise ValueError("points must have at least two coordinates for embedding='linear', got 1")
     spans = sizes - 1 if dimension is None else sizes * 0 + dimension
 
-    memberships = _start(start, count, len(names))
     checks.fuzzifier(m)
+    if isinstance(points, Blocks):
+        return fit_blocks(
+            points,
+            weights,
+            found,
+            start,
+            embedding,
+            tables[0],
+            real[0],
+            spans[0],
+            m,
+            noise_distance,
+            solver,
+            distance,
+            geometric,
+        )
+    memberships = _start(start, count, len(names))
     checks.noise_distance(noise_distance, count)
     weights = checks.weights(weights, count)
+    parts = Parts.of(points, solver.mesh)
     dtype = jnp.result_type(points, memberships)
     as_type = partial(jnp.asarray, dtype=dtype)
     arguments = (
@@ -206,6 +155,8 @@ def nfcv(
         "names": embedding if isinstance(embedding, str) else names,
         "distance": distance,
     }
+    if parts is not None:
+        options["parts"] = parts
     if not isinstance(embedding, str):
         return _fit_each(*arguments, **options)
     return _fit_single(*(a[0] for a in arguments[:4]), *arguments[4:], **options)
@@ -241,12 +192,18 @@ def _fit_one(
     acceleration: Literal["anderson"] | None,
     names: str | tuple[str, ...],
     distance: str,
+    parts: Parts | None = None,
 ) -> Varieties:
     """The compiled fit in one embedding, padded."""
+    if parts is not None:
+        return _divided(
+            parts, table, real, across, memberships, points, m, noise_distance, weights, tol, span=span, geometric=geometric,
+            max_steps=max_steps, acceleration=acceleration, names=names, distance=distance,
+        )  # fmt: skip
     chex.assert_rank([table, memberships, points], 2)
     chex.assert_equal_shape_prefix([memberships, points], 1)
     task, place = pose(table, real, across, points, m, noise_distance, weights, geometric=geometric)
-    begin = lax.stop_gradient(prototypes(moments(powers(m * jnp.log(memberships.T), weights), task), task))
+    begin = lax.stop_gradient(prototypes(moments(powers(m * jnp.log(memberships.T), weights), task), across))
     solver = Solver(max_steps, tol, acceleration)  # type: ignore[arg-type]
     solution = fixed_point(step, begin, task, solver, jacobian=jacobian, descent=not geometric)
     theta = solution.theta
@@ -265,8 +222,11 @@ def _fit_one(
     own = weights[:, None] * u * (labels[:, None] == jnp.arange(u.shape[1]))
     own = jnp.where(own.sum(axis=0) > 0, own, weights[:, None] * u)
     sums = moments(share, task)
-    normals, basis = directions(theta, place, sums[1], task, span)
-    return Varieties(
+    normals, basis = directions(theta, place, sums[1], real, across, span)
+    offset = jnp.where(used[:, None], points - points[jnp.argmax(weights)], 0)
+    extents = jnp.linalg.eigvalsh(weighted_moments(lax.stop_gradient(offset), weights[None])[1][0])
+    inliers = (~noisy & used).sum()
+    fit = Varieties(
         centers=place.origin + theta["centers"] @ place.back.T,
         normals=normals,
         basis=basis,
@@ -277,7 +237,7 @@ def _fit_one(
         inliers=~noisy,
         objective=jnp.where(used, part.objective(m), 0) @ weights * place.unit**2,
         steps=solution.steps,
-        status=status(theta, sums, task, points, ~noisy & used, solution.converged),
+        status=status(theta, sums, real, across, extents, inliers, solution.converged),
         m=m,
         noise_distance=jnp.asarray(jnp.inf, points.dtype) if noise_distance is None else noise_distance,
         origin=mean,
@@ -289,9 +249,47 @@ def _fit_one(
         embedding=names,
         distance=distance,
     )
+    return unless_finite(fit)
 
 
-_STATIC = ("span", "geometric", "max_steps", "acceleration", "names", "distance")
+def _divided(
+    parts: Parts,
+    table: Array,
+    real: Array,
+    across: Array,
+    memberships: Array,
+    points: Array,
+    m: Array,
+    noise_distance: Array | None,
+    weights: Array,
+    tol: Array,
+    **options: Any,
+) -> Varieties:
+    """The same with whatever has one entry a point divided among devices; the compiler puts the sums together."""
+    count = points.shape[0]
+    noise = noise_distance
+    if noise is not None and noise.ndim:
+        filler = jnp.ones(-count % parts.count, noise.dtype)
+        noise = parts.split(jnp.concatenate([noise, filler]))
+    fit = _fit_one(
+        table,
+        real,
+        across,
+        parts.split(memberships),
+        parts.split(points),
+        m,
+        noise,
+        parts.split(weights),
+        tol,
+        **options,
+    )
+    own = {
+        name: getattr(fit, name)[:count] for name in ("squared_distances", "memberships", "noise", "labels", "inliers")
+    }
+    return replace(fit, **own, noise_distance=fit.noise_distance if noise_distance is None else noise_distance)
+
+
+_STATIC = ("span", "geometric", "max_steps", "acceleration", "names", "distance", "parts")
 
 
 _fit_single = partial(jax.jit, static_argnames=_STATIC)(_fit_one)

@@ -76,8 +76,9 @@ def pose(
     weights: Float[Array, " N"],
     *,
     geometric: bool,
+    whole: tuple[Array, Array, Array] | None = None,
 ) -> tuple[Task, Frame]:
-    """Sets the task up in a well-conditioned frame.
+    """Sets the task up in a well-conditioned frame; that of `whole`, (mean, unit, mean of the features), where points are a block.
 
     The geometric distance does not change when the points are shifted, and scales with them, so the points themselves are
     centered and scaled. The algebraic one depends on where the points are, so only the embedded points are. Both maps
@@ -86,13 +87,13 @@ def pose(
     used = (weights > 0)[:, None]
     points = jnp.where(used, points, 0)
     if geometric:
-        mean, unit = lax.stop_gradient(frame(points, weights))
+        mean, unit = lax.stop_gradient(frame(points, weights) if whole is None else whole[:2])
         unit = jnp.where(unit > 0, unit, 1)
         points = jnp.where(used, (points - mean) / unit, 0)
         gradients = jnp.einsum("qm,nmd->nqd", table, monomial_gradients(points))
         slopes = jnp.einsum("nqd,npd->qpn", gradients, gradients)
         features = monomials(points) @ table.T
-        middle = lax.stop_gradient(weights @ features / weights.sum())
+        middle = lax.stop_gradient(weights @ features / weights.sum() if whole is None else whole[2])
         features = jnp.where(used, features - middle, 0)
         matrix, constant = monomials_of_affine(unit, mean)
         inverse, _ = monomials_of_affine(1 / unit, -mean / unit)
@@ -100,7 +101,7 @@ def pose(
         place = Frame(table @ constant + back @ middle, back, forward, unit)
     else:
         features, slopes = monomials(points) @ table.T, None
-        middle, unit = lax.stop_gradient(frame(features, weights))
+        middle, unit = lax.stop_gradient(frame(features, weights) if whole is None else (whole[2], whole[1]))
         unit = jnp.where(unit > 0, unit, 1)
         features = jnp.where(used, (features - middle) / unit, 0)
         one = jnp.eye(middle.size, dtype=unit.dtype)
@@ -113,7 +114,8 @@ def step(theta: Prototypes, task: Task) -> tuple[Prototypes, Array]:
     """One round of alternating optimisation (eqs. 15 to 17 and 20), and the logarithm of the objective it started from."""
     part, _ = divide_points(theta, task)
     objective = jnp.where(task.weights > 0, part.objective(task.m), 0) @ task.weights
-    return prototypes(moments(powers(part.log_powers(task.m), task.weights), task), task), jnp.log(objective)
+    sums = moments(powers(part.log_powers(task.m), task.weights), task)
+    return prototypes(sums, task.across), jnp.log(objective)
 
 
 def divide_points(theta: Prototypes, task: Task) -> tuple[Shares, Float[Array, "C N"]]:
@@ -142,16 +144,18 @@ Moments = tuple[Array, Array, Array | None]
 
 
 def moments(share: Float[Array, "C N"], task: Task) -> Moments:
-    """Centers (eq. 15), scatter (eq. 16) and, with the geometric distance, the mean of gradient products.
-
-    Padded coordinates get an eigenvalue well above the smallest, so that none is ever a normal.
-    """
+    """Centers (eq. 15), scatter (eq. 16) and, with the geometric distance, the mean of gradient products."""
     centers, scatter = weighted_moments(task.features.T, share)
-    pad = jnp.diag(jnp.where(task.real, 0, 1).astype(scatter.dtype))
+    metric = None if task.slopes is None else jnp.einsum("cn,qpn->cqp", shares_of_one(share), task.slopes)
+    return padded_moments(centers, scatter, metric, task.real)
+
+
+def padded_moments(centers: Array, scatter: Array, metric: Array | None, real: Bool[Array, " Q"]) -> Moments:
+    """Gives padded coordinates an eigenvalue well above the smallest, so that none is ever a normal."""
+    pad = jnp.diag(jnp.where(real, 0, 1).astype(scatter.dtype))
     total = lax.stop_gradient(jnp.trace(scatter, axis1=1, axis2=2))
-    if task.slopes is None:
+    if metric is None:
         return centers, scatter + (1 + total)[:, None, None] * pad, None
-    metric = jnp.einsum("cn,qpn->cqp", shares_of_one(share), task.slopes)
     # The smallest eigenvalue is no larger than the quotient of the traces.
     most = divide(total, lax.stop_gradient(jnp.trace(metric, axis1=1, axis2=2)))
     return centers, scatter + (1 + 2 * LEAST_GAP * most)[:, None, None] * pad, metric + pad
@@ -162,11 +166,11 @@ def shares_of_one(weights: Float[Array, "C N"]) -> Float[Array, "C N"]:
     return divide(weights, weights.sum(axis=1, keepdims=True))
 
 
-def prototypes(sums: Moments, task: Task) -> Prototypes:
+def prototypes(sums: Moments, across: Int[Array, ""]) -> Prototypes:
     """The varieties that the moments call for."""
     centers, scatter, metric = sums
     if metric is None:
-        return {"centers": centers, "across": jax.vmap(smallest_projector, (0, None))(scatter, task.across)}
+        return {"centers": centers, "across": jax.vmap(smallest_projector, (0, None))(scatter, across)}
     normals = jax.vmap(smallest_eigenvector)(scatter, metric)
     normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     return {"centers": centers, "across": normals[:, :, None] * normals[:, None]}
@@ -189,37 +193,35 @@ def jacobian(theta: Prototypes, task: Task) -> Float[Array, "p p"]:
 def status(
     theta: Prototypes,
     sums: Moments,
-    task: Task,
-    points: Float[Array, "N D"],
-    inliers: Bool[Array, " N"],
+    real: Bool[Array, " Q"],
+    across_count: Int[Array, ""],
+    extents: Float[Array, " D"],
+    inliers: Int[Array, ""],
     converged: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Every reason to mistrust a fit."""
-    theta, sums, task, points = lax.stop_gradient((theta, sums, task, points))
+    """Every reason to mistrust a fit; `extents` are the eigenvalues of the points' scatter, `inliers` those that are no noise."""
+    theta, sums, extents = lax.stop_gradient((theta, sums, extents))
     centers, across = theta["centers"], theta["across"]
     _, scatter, metric = sums
-    eps = jnp.finfo(points.dtype).eps
+    eps = jnp.finfo(extents.dtype).eps
     if metric is None:
         values = jnp.linalg.eigvalsh(scatter)
-        largest = jnp.trace(scatter * task.real, axis1=1, axis2=2)
-        undetermined = values[:, task.across] - values[:, task.across - 1] <= 1e3 * eps * largest
+        largest = jnp.trace(scatter * real, axis1=1, axis2=2)
+        undetermined = values[:, across_count] - values[:, across_count - 1] <= 1e3 * eps * largest
     else:
         values = jax.vmap(lambda a, b: pencil(a, b)[0])(scatter, metric)
         undetermined = values[:, 1] <= LEAST_GAP * values[:, 0] + 1e3 * eps
-    offset = jnp.where((task.weights > 0)[:, None], points - points[jnp.argmax(task.weights)], 0)
-    extents = jnp.linalg.eigvalsh(weighted_moments(offset, task.weights[None])[1][0])
-
     clusters = centers.shape[0]
     apart = centers[:, None] - centers
     near = jnp.einsum("abq,bqp,abp->ab", apart, across, apart) <= SAME_PLACE**2
     parallel = jnp.abs(across[:, None] - across).max(axis=(2, 3)) <= SAME_PLACE
     # Any surface passes through as many points as it has coordinates, so those prove nothing.
-    enough = inliers.sum() > clusters * task.real.sum()
+    enough = inliers > clusters * real.sum()
     bits = [
         (Status.NOT_CONVERGED, ~converged),
         (Status.NOT_FINITE, ~(jnp.isfinite(centers).all() & jnp.isfinite(across).all())),
         (Status.MERGED, (near & parallel & ~jnp.eye(clusters, dtype=bool)).any()),
-        (Status.ALL_NOISE, ~inliers.any()),
+        (Status.ALL_NOISE, inliers == 0),
         (Status.TOO_FEW_POINTS, ~enough),
         (Status.DEGENERATE, extents[1] <= 1e3 * eps * extents[-1]),
         (Status.UNDER_DETERMINED, undetermined.any()),
@@ -228,7 +230,12 @@ def status(
 
 
 def directions(
-    theta: Prototypes, place: Frame, scatter: Float[Array, "C Q Q"], task: Task, span: int
+    theta: Prototypes,
+    place: Frame,
+    scatter: Float[Array, "C Q Q"],
+    real: Bool[Array, " Q"],
+    across: Int[Array, ""],
+    span: int,
 ) -> tuple[Float[Array, "C Q"], Float[Array, "C Q q"]]:
     """Unit normals, zero where a variety has several, and an orthonormal basis, both in the input's frame.
 
@@ -240,13 +247,13 @@ def directions(
         # A hyperplane's coefficients are pulled back by the transposed map of points.
         normal = normalised(place.forward.T @ inside)
         normal = normal * jnp.where(normal[jnp.argmax(jnp.abs(normal))] < 0, -1, 1)
-        single = task.across == 1
+        single = across == 1
         off = jnp.where(single, jnp.outer(normal, normal), projector)
-        along = jnp.diag(task.real.astype(off.dtype)) - off
+        along = jnp.diag(real.astype(off.dtype)) - off
         here = place.back @ scatter @ place.back.T
         ranked = along @ here @ along + (1 + jnp.trace(here)) * along
         vectors = jnp.linalg.eigh(lax.stop_gradient(ranked))[1][:, ::-1][:, :span]
-        mine = jnp.arange(span) < task.real.sum() - task.across
+        mine = jnp.arange(span) < real.sum() - across
         return jnp.where(single, normal, 0), jnp.where(mine, vectors, 0)
 
     return jax.vmap(one)(theta["across"], scatter)

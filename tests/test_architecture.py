@@ -10,10 +10,11 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "jaxfuzzy"
 # Each module may import those before it, never those after it.
 ORDER = """
-    arrays status checks linalg memberships tiles solve alternation fcm embedding varietystep varieties conditioning
+    arrays status checks files linalg memberships tiles solve alternation blocks fcm embedding
+    varietystep varietyresult varietyblocks varieties conditioning
     seeding validity density segment meshes primitives refine recover bodies simulate
     objects rays bounds starts local choice candidates screening finalists search polish fitting looks mostpoints shapes groups
-    files cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
+    cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
     scene losses tuning sensitivity drawing plot export folder page report table estimators arguments terminal cli __init__
 """.split()
 DOORS = {
@@ -90,9 +91,9 @@ def test_core_needs_no_extra():
 
 # The contract of the top level: taking a name away must be deliberate.
 PUBLIC = """
-    Box Cloud ClusterCount Cone Cylinder DataError Hyper Influence Matcher NoiseRule Partition Plane Quadric Rig Scene
+    Blocks Box Cloud ClusterCount Cone Cylinder DataError Hyper Influence Matcher NoiseRule Partition Plane Quadric Rig Scene
     Seeds Segmentation Shape Solver Sphere Status Tuned Varieties
-    calibrate choose_k cloud_from_disparity conditioning describe disparity example_pair fcm find_ground fit_shape
+    blocks calibrate choose_k cloud_from_disparity conditioning describe disparity example_pair fcm find_ground fit_shape
     fit_shapes fuzzy_silhouette histogram_seeds influence load_rig load_scene memberships model_cloud model_scene nfcv
     partition_coefficient principal_axes read_cloud reconstruct recover rectify save_rig segment tune upright
     variance_ratio write_cloud xie_beni
