@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.arrays import Array, as_float, is_concrete
@@ -168,7 +169,11 @@ def _numeric(value: Any, name: str) -> Any:
 
 
 def _finite(array: Array, name: str) -> Array:
-    if is_concrete(array):
+    if isinstance(array, jax.Array) and is_concrete(array) and not array.is_fully_addressable:
+        # Spread over several processes, none of which may look at all of it; every one comes to the same answer.
+        if not bool(jnp.isfinite(array).all()):
+            raise ValueError(f"{name} must be finite, got non-finite rows")
+    elif is_concrete(array):
         bad = ~np.isfinite(np.asarray(array))
         if bad.any():
             rows = np.flatnonzero(bad.reshape(len(array), -1).any(axis=1)) if array.ndim else np.array([0])

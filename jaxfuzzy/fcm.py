@@ -148,6 +148,7 @@ def fcm(
     given = None if rule else checks.noise_distance(noise_distance)
     dtype = jnp.result_type(points, seeds)
     parts = Parts.of(points, solver.mesh)
+    points = points if parts is None else parts.place(points)
     points, seeds = points.astype(dtype), seeds.astype(dtype)
     as_type = partial(jnp.asarray, dtype=dtype)
     return _fit(

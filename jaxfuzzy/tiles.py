@@ -59,13 +59,16 @@ class Parts:
         sizes = dict(self.mesh.shape)
         return math.prod(sizes[name] for name in self.axes)
 
+    def place(self, array: Array) -> Array:
+        """Divides a known array where it comes out even; the rest is done by `split` inside the compiled function."""
+        if isinstance(array, jax.core.Tracer) or array.shape[0] % self.count:
+            return array
+        return jax.device_put(array, NamedSharding(self.mesh, PartitionSpec(self.axes)))
+
     def split(self, array: Array) -> Array:
         """An array with its first axis divided among the devices, zeros added where it does not come out even."""
         array = jnp.pad(array, [(0, -array.shape[0] % self.count)] + [(0, 0)] * (array.ndim - 1))
-        place = NamedSharding(self.mesh, PartitionSpec(self.axes))
-        if isinstance(array, jax.core.Tracer):
-            return lax.with_sharding_constraint(array, place)
-        return jax.device_put(array, place)
+        return lax.with_sharding_constraint(array, NamedSharding(self.mesh, PartitionSpec(self.axes)))
 
     def each(self, do: Callable[..., Any], *arrays: Array, whole: bool = False) -> Any:
         """Does something to each part of some arrays; `whole` where the outcome is the same for all."""

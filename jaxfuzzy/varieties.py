@@ -134,6 +134,7 @@ def nfcv(
     checks.noise_distance(noise_distance, count)
     weights = checks.weights(weights, count)
     parts = Parts.of(points, solver.mesh)
+    points = points if parts is None else parts.place(points)
     dtype = jnp.result_type(points, memberships)
     as_type = partial(jnp.asarray, dtype=dtype)
     arguments = (
