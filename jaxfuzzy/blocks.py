@@ -220,10 +220,11 @@ def blocks(
             ) from None
     if isinstance(source, Iterator):
         raise TypeError("source is used up after one sweep: give a list, or a function that makes a new iterator")
+    shaped: Any = source
     if hasattr(source, "shape"):
-        if len(source.shape) != 2 or np.dtype(source.dtype).kind not in "fiub":
+        if len(shaped.shape) != 2 or np.dtype(shaped.dtype).kind not in "fiub":
             raise ValueError(
-                f"source must hold real numbers of shape (N, D), got {source.dtype} of shape {source.shape}"
+                f"source must hold real numbers of shape (N, D), got {shaped.dtype} of shape {shaped.shape}"
             )
     elif not callable(source) and not isinstance(source, Iterable):
         raise TypeError(

@@ -318,7 +318,7 @@ def fixed_point_outside(
     flat, unravel = ravel_pytree(start)
     effort = solver.traced(flat.dtype)
     loop = _alternation(flat, effort.tol, effort.max_steps, effort.accelerate, descent)
-    names = [field.name for field in dataclasses.fields(_State)]  # type: ignore[arg-type]
+    names = [field.name for field in dataclasses.fields(_State)]
 
     def steps(tried: Array) -> tuple[Array, Array]:
         ahead, merits = step([unravel(y) for y in tried])

@@ -148,7 +148,7 @@ def nfcv(
         jnp.ones(count, dtype) if weights is None else weights.astype(dtype),
         as_type(solver.tol),
     )
-    options = {
+    options: dict[str, Any] = {
         "span": int(spans.max()),
         "geometric": geometric,
         "max_steps": solver.max_steps,

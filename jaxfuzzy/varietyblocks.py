@@ -218,7 +218,7 @@ def merged(blocks: list[Moments]) -> Moments:
     metric = None
     if each[0].metric is not None:
         metric = sum(part[:, None, None] * one.metric for part, one in zip(parts, each, strict=True))
-    return Moments(mass, top, centers, scatter, metric, sum(one.objective for one in each))  # type: ignore[arg-type]
+    return Moments(mass, top, centers, scatter, metric, sum(one.objective for one in each))
 
 
 @jax.jit

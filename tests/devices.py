@@ -1,6 +1,6 @@
 """Run by `test_devices` in processes of their own: fits on several devices, compared with one.
 
-python tests/devices.py alone 4                  four devices in this process
+python tests/devices.py alone 4 [more]           four devices in this process
 python tests/devices.py together PORT NUMBER     one of two processes with a device each
 """
 
@@ -61,15 +61,17 @@ def alone() -> None:
     print("parts", len(found.memberships.sharding.device_set), flush=True)
     placed = jax.device_put(x[:1000], NamedSharding(jax.make_mesh((HERE,), ("anything",)), PartitionSpec("anything")))
     check("fcm where the array lies", jf.fcm(placed, x[:3], solver=one), jf.fcm(x[:1000], x[:3], solver=one), shared)
+    start = np.random.default_rng(2).dirichlet(np.ones(2), N)
+    settings = {"embedding": "4d", "noise_distance": 0.5, "weights": weights}
+    lines = [jf.nfcv(x, start, **settings, solver=jf.Solver(10, 0.0, mesh=mesh)) for mesh in (None, DEVICES)]
+    check("nfcv", lines[1], lines[0], ("centers", "normals", "objective", "memberships", "labels", "bounds"))
+    if "more" not in sys.argv:
+        return
     by_blocks = jf.fcm(jf.blocks(x, rows=400), x[:3], **options, memberships=False, solver=many)
     check("fcm over blocks", by_blocks, whole, shared)
     slopes = [jax.grad(lambda m, s=s: jf.fcm(x, x[:3], m=m, solver=s).centers.std())(1.8) for s in (one, many)]
     np.testing.assert_allclose(*slopes, rtol=1e-7)
     print("same gradient", flush=True)
-    start = np.random.default_rng(2).dirichlet(np.ones(2), N)
-    options = {"embedding": "4d", "noise_distance": 0.5, "weights": weights}
-    lines = [jf.nfcv(x, start, **options, solver=jf.Solver(10, 0.0, mesh=mesh)) for mesh in (None, DEVICES)]
-    check("nfcv", lines[1], lines[0], ("centers", "normals", "objective", "memberships", "labels", "bounds"))
 
 
 def together() -> None:

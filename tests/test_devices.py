@@ -33,17 +33,11 @@ def ended(process):
     return out.splitlines()
 
 
-@pytest.mark.parametrize("devices", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_devices_of_one_process(devices):
-    lines = ended(start("alone", devices))
-    assert lines == [
-        "same fcm",
-        f"parts {devices}",
-        "same fcm where the array lies",
-        "same fcm over blocks",
-        "same gradient",
-        "same nfcv",
-    ]
+@pytest.mark.parametrize(("devices", "more"), [(2, ()), pytest.param(4, ("more",), marks=pytest.mark.slow)])
+def test_devices_of_one_process(devices, more):
+    lines = ended(start("alone", devices, *more))
+    expected = ["same fcm", f"parts {devices}", "same fcm where the array lies", "same nfcv"]
+    assert lines == expected + (["same fcm over blocks", "same gradient"] if more else [])
 
 
 def test_two_processes():
@@ -51,10 +45,9 @@ def test_two_processes():
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     both = [start("together", port, number) for number in range(2)]
-    for process in both:
-        lines = ended(process)
-        assert lines[0] == "same fcm"
-        assert lines[1].startswith("refused: points must be finite")
+    for out in [ended(process) for process in both]:
+        lines = [line for line in out if not line.startswith("[Gloo]")]
+        assert lines == ["same fcm", "refused: points must be finite, got non-finite rows"]
 
 
 @pytest.mark.parametrize("platform", ["cuda", "tpu"])
