@@ -1,6 +1,6 @@
 """Cost of a sweep against the number of points and of clusters: linear in both, with a plot.
 
-    python benchmarks/scaling.py [--most 1e7]
+    python benchmarks/scaling.py [--most 3e7] [--memory]
 
 Float32, D = 3, m = 2 and m = 1.7; one sweep from two runs of different length, warm. Peak memory is that of a process of its own,
 less what it held before the points were made.
@@ -43,7 +43,13 @@ def a_sweep(n: int, k: int, m: float) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--most", type=float, default=1e7, help="largest number of points")
+    parser.add_argument("--memory", action="store_true", help="peak memory at the largest number of points alone")
     args = parser.parse_args()
+    if args.memory:
+        held = json.loads(subprocess.check_output([sys.executable, "-c", CODE, str(int(args.most))], text=True))
+        print(f"{int(args.most)} points: peak memory {held:.2f} times their own size")
+        write("memory", {"points": int(args.most), "times_own_size": held})
+        return
     print(provenance())
     counts = [n for n in (10**3, 10**4, 10**5, 10**6, 3 * 10**6, 10**7, 3 * 10**7) if n <= args.most]
     clusters = (2, 4, 8, 16, 32, 64)

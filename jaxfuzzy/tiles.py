@@ -45,7 +45,7 @@ class Parts:
             axes = mesh.axis_names
         elif isinstance(points, jax.Array) and not isinstance(points, jax.core.Tracer):
             kind = points.sharding
-            if isinstance(kind, NamedSharding) and len(kind.spec) and kind.spec[0] is not None:
+            if isinstance(kind, NamedSharding) and isinstance(kind.mesh, Mesh) and len(kind.spec) and kind.spec[0]:
                 mesh, axes = kind.mesh, kind.spec[0]
         if mesh is None or mesh.size == 1:
             return None
