@@ -68,7 +68,8 @@ SENTENCES: dict[Status, str] = {
     Status.REFUSED: "None of the known kinds fits: named 'quadric' or 'unknown' rather than guessed.",
     Status.LOW_MARGIN: "The best kind is barely better than the next: look at the scores.",
     Status.UNSTABLE: "Two centers coincide only because their seeds did and would part if nudged: start from other seeds.",
-    Status.FLAT_LOSS: "The loss changes with nothing that is tuned: let it read the values, or start where it does change.",
+    Status.FLAT_LOSS: "The loss changes at the start with nothing that is tuned: it does not read the values, jumps between"
+    " plateaus, has lost all clusters, or is least there already; start elsewhere to tell.",
     Status.STALLED: "No shorter step lowered the loss though its gradient is not zero: it jumps or bends here (labels flip,"
     " clusters merge, a maximum is taken), or its fits are too coarse: use a smooth loss, tighten Solver(tol=...), or start"
     " elsewhere.",

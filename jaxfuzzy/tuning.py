@@ -122,7 +122,7 @@ def tune(
     if not trail.finite:
         return trail.told(1, Status.NOT_FINITE)
     if steepest <= _rounding(first.f_info.f):
-        return trail.told(1, Status.FLAT_LOSS if steepest == 0 else Status(0))
+        return trail.told(1, Status.FLAT_LOSS)
     scale = jnp.asarray(FIRST_MOVE / steepest, dtype)
     y, evaluations, refused, arrived, lost = origin, 1, 0, False, False
     while evaluations < steps and refused < MOST_REFUSALS and not (arrived or lost):

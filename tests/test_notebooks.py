@@ -29,6 +29,8 @@ def test_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     assert not any(cell.get("outputs") for cell in book.cells), "outputs are not kept"
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.jax_compilation_cache_dir))
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+    # Everything is compiled for one run, so optimising the code takes longer than it saves.
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     # In an empty folder: nothing beside the notebook is needed.
     client = nbclient.NotebookClient(

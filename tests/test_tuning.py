@@ -16,6 +16,15 @@ from jaxfuzzy.status import Status
 from jaxfuzzy.tuning import Hyper, tune
 from jaxfuzzy.varieties import nfcv
 
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_for_one_run():
+    """Small data and many programs: optimising the code takes longer than it saves."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 EXACT = Solver(max_steps=5_000, tol=1e-13)
 GOOD = Hyper(1.4, jnp.array([0.3, 5.0]), jnp.array([0.0, 2.0, 0.5]))
 
@@ -128,9 +137,10 @@ def test_out_of_steps_is_not_converged():
     assert tuned.evaluations == 3
 
 
-def test_a_start_at_the_minimum_has_arrived():
+def test_a_start_without_slope_is_not_called_a_minimum():
+    # Flat to rounding: a minimum here, but a plateau would look the same.
     tuned = tune(by_noise(lambda d: 1 + d**2), Hyper(2.0, 1.0 + 1e-12))
-    assert int(tuned.status) == 0
+    assert Status(int(tuned.status)) == Status.FLAT_LOSS
     assert tuned.evaluations == 1
 
 
