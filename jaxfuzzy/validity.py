@@ -83,7 +83,8 @@ def choose_k(
         The choice with all candidates' scores and partitions.
 
     Raises:
-        ValueError: Empty or repeated `ks`, a k out of range, 1 among `ks` for an index that cannot score it, unknown names.
+        ValueError: Empty or repeated `ks`, a k out of range, 1 among `ks` for an index that cannot score it, unknown names,
+            a solver for several devices.
     """
     array = checks.points(points)
     candidates = [
@@ -98,6 +99,8 @@ def choose_k(
         raise ValueError(f"ks must not hold 1 for index={index!r}, which cannot score one cluster; index='jump' can")
     if index == "jump" and candidates != list(range(1, len(candidates) + 1)):
         raise ValueError(f"ks must be 1, 2, ... without a gap for index='jump', got {tuple(candidates)}")
+    if solver.mesh is not None:
+        raise ValueError("solver must have no mesh: choose_k runs on one device; use fcm for each k on several")
     checks.fuzzifier(m)
     weights = checks.weights(weights, array.shape[0])
     noise = noise_distance if isinstance(noise_distance, NoiseRule) else checks.noise_distance(noise_distance)

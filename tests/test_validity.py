@@ -139,6 +139,10 @@ def test_wrong_arguments_are_named():
         choose_k(x, (2, 3), index="jump")
     with pytest.raises(ValueError, match="rule"):
         choose_k(x, rule="nice")
+    with pytest.raises(ValueError, match="mesh"):
+        choose_k(
+            np.random.default_rng(0).normal(size=(30, 2)), (2, 3), solver=Solver(mesh=jax.make_mesh((1,), ("points",)))
+        )
     with pytest.raises(ValueError, match="labels"):
         variance_ratio(x, np.zeros(len(x), int))
     with pytest.raises(ValueError, match="memberships"):
