@@ -9,8 +9,8 @@ nbformat = pytest.importorskip("nbformat", reason="notebooks need the extra note
 nbclient = pytest.importorskip("nbclient", reason="notebooks need the extra notebooks")
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-# The shape search is compiled in these; run them with: python -m pytest -m slow tests/test_notebooks.py
-SLOW = {"2_own_pair", "4_shapes_and_ransac"}
+# These compile for long; run them with: python -m pytest -m slow tests/test_notebooks.py
+SLOW = {"2_own_pair", "4_shapes_and_ransac", "5_tuning"}
 NOTEBOOKS = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in SLOW else [])
     for path in sorted(FOLDER.glob("*.ipynb"))

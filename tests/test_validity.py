@@ -58,7 +58,11 @@ def test_other_indices_are_their_definitions():
     np.testing.assert_allclose(fuzzy_silhouette(x, p), share @ width / share.sum(), rtol=1e-10)
 
 
-@pytest.mark.parametrize("index", ["vrc", "xie_beni", "fuzzy_silhouette", "modified_partition_coefficient", "jump"])
+# Each is a compilation of its own; those whose formula is tested above by itself are slow ones.
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("xie_beni", "modified_partition_coefficient")]
+
+
+@pytest.mark.parametrize("index", ["vrc", "fuzzy_silhouette", "jump", *SLOW])
 def test_right_number_of_clear_lumps(index):
     for k in (2, 3, 4):
         ks = (1, 2, 3, 4, 5) if index == "jump" else (2, 3, 4, 5)
