@@ -56,10 +56,10 @@ BALL_DIAMETER_MM = 203.7  # measured on the true disparities
 NEAR_PX = 6
 
 
-def owner_at(scene: jf.Scene, column: float, row: float, scale: float = 1.0) -> int | None:
+def owner_at(scene: jf.Scene, column: float, row: float) -> int | None:
     """The object that most points around a place belong to."""
     pixels, labels = np.asarray(scene.cloud.pixels_px), np.asarray(scene.segmentation.labels)
-    here = labels[(np.abs(pixels - scale * np.array([column, row])).max(axis=1) <= scale * NEAR_PX) & (labels >= 0)]
+    here = labels[(np.abs(pixels - [column, row]).max(axis=1) <= NEAR_PX) & (labels >= 0)]
     return int(np.bincount(here).argmax()) if len(here) else None
 
 

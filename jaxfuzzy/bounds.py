@@ -5,6 +5,8 @@ become rare: the stretch that holds the most points over a price per length, a t
 outliers beyond do not move it and it lands on the last point of the surface itself.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -73,7 +75,7 @@ def ends_of(
             if detail[i]:
                 ends[i, 1 if detail[i] > 0 else 0] = theta[1 + i]
     elif kind == "plane":
-        first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]))
+        first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]), np)
         a, b = hits[on] @ first, hits[on] @ second
         # The rectangle of least area, turned in its plane.
         turns = np.deg2rad(np.arange(0, 90, 3.0))
@@ -126,7 +128,7 @@ def assembled(
         )
     length = jnp.sqrt((theta[:3] ** 2).sum())
     normal = theta[:3] / length
-    first, second = _patch_axes_jax(normal)
+    first, second = _patch_axes(normal, jnp)
     c, s = jnp.cos(ends[2, 0]), jnp.sin(ends[2, 0])
     first, second = c * first + s * second, c * second - s * first
     foot = normal * theta[3] / length
@@ -137,19 +139,11 @@ def assembled(
     return Plane(point=corners.mean(0), normal=turn.T @ normal, corners=corners)
 
 
-def _patch_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions in a plane: the level one, or where the plane is level itself, x; and the one across."""
-    level = np.array([normal[2], 0.0, -normal[0]])
-    if level @ level < FLAT:
-        level = np.array([normal[1], -normal[0], 0.0])
-    first = level / np.sqrt(level @ level)
-    return first, np.cross(normal, first)
-
-
-def _patch_axes_jax(normal: Array) -> tuple[Array, Array]:
-    """The same, traced."""
-    level = jnp.stack([normal[2], jnp.zeros_like(normal[0]), -normal[0]])
+def _patch_axes(normal: Any, xp: Any) -> tuple[Any, Any]:
+    """Two directions in a plane, by NumPy or traced: the level one, or where the plane is level itself, x; and the one across."""
+    zero = xp.zeros_like(normal[0])
+    level = xp.stack([normal[2], zero, -normal[0]])
     flat = (level**2).sum() < FLAT
-    level = jnp.where(flat, jnp.stack([normal[1], -normal[0], jnp.zeros_like(normal[0])]), level)
-    first = level / jnp.sqrt((level**2).sum())
-    return first, jnp.cross(normal, first)
+    level = xp.where(flat, xp.stack([normal[1], -normal[0], zero]), level)
+    first = level / xp.sqrt((level**2).sum())
+    return first, xp.cross(normal, first)

@@ -142,11 +142,11 @@ def _divided(
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups that two surfaces hold much better than one, and these."""
     tried = {
-        k: own[np.argsort(_side(flat[own]), kind="stable")]
+        k: own
         for k, (own, shape) in enumerate(zip(members, shapes, strict=True))
         if k not in taken and len(own) >= 2 * FEWEST and _held(shape) < WHOLE * len(own)
     }
-    side = {k: np.sort(_side(flat[members[k]])) for k in tried}
+    side = {k: _side(flat[own]) for k, own in tried.items()}
     good: dict[int, list[tuple[np.ndarray, Shape]]] = {}
     # Places make the first cut, the two surfaces it gives the second.
     for _ in range(2):
