@@ -1,7 +1,7 @@
 """The command line: stereo pairs, clouds, tables and calibration boards in; results on disk and a short table out.
 
 Results go to standard output, everything else to standard error. Exit status: 0 done, 1 the data could not be modelled,
-2 wrong use or unreadable input, 130 stopped by Ctrl-C. Heavy modules are imported on use, so that help comes at once.
+2 wrong use or unreadable input, 130 stopped by Ctrl-C.
 """
 
 import argparse
@@ -260,8 +260,12 @@ def _modelling() -> Any:
 
 def _set_up_process() -> None:
     """Keeps what JAX compiles in the user's cache folder, so that a second run need not compile."""
+    import gc
+
     import jax
 
+    # Tracing makes millions of short-lived objects: looking for cycles among them every 700 took a tenth of a run.
+    gc.set_threshold(100_000)
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return  # the user, or a test, has chosen
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfuzzy"

@@ -7,13 +7,11 @@ import json
 import struct
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import drawing
-from jaxfuzzy.arrays import Array
-from jaxfuzzy.primitives import KINDS, Primitive
+from jaxfuzzy.fitting import distances
+from jaxfuzzy.primitives import KINDS
 
 if TYPE_CHECKING:
     from jaxfuzzy.scene import Scene
@@ -53,18 +51,6 @@ def point_columns(scene: "Scene") -> dict[str, np.ndarray]:
         "inlier": inlier,
         "residual": residual,
     }
-
-
-def distances(body: Primitive, points: np.ndarray) -> np.ndarray:
-    """Distances in metres of points (N, 3) to a primitive, compiled once a kind and power of two of N."""
-    room = max(1 << (len(points) - 1).bit_length(), 1024) if len(points) else 1024
-    padded = np.concatenate([points, np.broadcast_to(points[:1], (room - len(points), 3))]) if len(points) else points
-    return np.asarray(_distance(body, jnp.asarray(padded)))[: len(points)]
-
-
-@jax.jit
-def _distance(body: Primitive, points: Array) -> Array:
-    return body.distance(points)
 
 
 def bodies(scene: "Scene") -> list[tuple[str, int, dict[str, Any], np.ndarray, np.ndarray]]:

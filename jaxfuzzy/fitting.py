@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxfuzzy import bounds, polish, rays, search
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.objects import Frame
+from jaxfuzzy.objects import Frame, capacity_for
 from jaxfuzzy.primitives import Primitive
 
 FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
@@ -54,6 +55,7 @@ def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: b
         along_ray: Whether residuals are along the viewing ray.
     """
 
+    @jax.jit
     def one(item: dict[str, Array]) -> Fitted:
         view = _view(item, along_ray)
         dtype = view.gain.dtype
@@ -110,10 +112,28 @@ def assemble_batch(
             return bounds.assembled(kind, x[:5], x[5:7], moved, detail, turn, frame)
 
         x = jnp.concatenate([theta, jnp.zeros(2, theta.dtype), ends[:, :2].ravel()])
-        slope = jax.jacfwd(lambda x: build(x).parameters())(x)
+
+        def parameters(x: Array) -> tuple[Array, Primitive]:
+            primitive = build(x)
+            return primitive.parameters(), primitive
+
+        slope, primitive = jax.jacfwd(parameters, has_aux=True)(x)
         errors = jnp.repeat(ends[:, 2] ** 2, 2)
         full = jnp.zeros((13, 13), theta.dtype).at[:7, :7].set(covariance)
         full = full.at[jnp.arange(7, 13), jnp.arange(7, 13)].set(errors)
-        return build(x), slope @ full @ slope.T
+        return primitive, slope @ full @ slope.T
 
     return jax.vmap(one)(theta, covariance, turn, detail, ends, frame)
+
+
+def distances(primitive: Primitive, points: np.ndarray) -> np.ndarray:
+    """Distances in metres of points (N, 3) from a bounded primitive, by a program of one of a few sizes."""
+    if not len(points):
+        return np.zeros(0, points.dtype)
+    padded = np.pad(points, ((0, capacity_for(len(points)) - len(points)), (0, 0)), mode="edge")
+    return np.asarray(_distances(primitive, padded))[: len(points)]
+
+
+@jax.jit
+def _distances(primitive: Primitive, points: Array) -> Array:
+    return primitive.distance(points)

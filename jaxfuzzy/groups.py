@@ -9,14 +9,12 @@ are two.
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.arrays import Array
 from jaxfuzzy.fcm import fcm
+from jaxfuzzy.fitting import distances
 from jaxfuzzy.objects import capacity_for
-from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
@@ -122,7 +120,7 @@ def _whole(
     every = np.sort(np.concatenate([members[k] for k in pair]))
     if len(own) == len(every) or shape.primitive is None:
         return own, shape
-    inliers = _away(shape, points[every]) <= float(shape.noise_distance)
+    inliers = distances(shape.primitive, points[every]) <= float(shape.noise_distance)
     inliers[np.isin(every, own)] = np.asarray(shape.inliers)
     return every, dataclasses.replace(shape, inliers=jnp.asarray(inliers))
 
@@ -158,28 +156,17 @@ def _divided(
         for k, two in pieces.items():
             both = [(piece, next(found)) for piece in two]
             count = sum(_held(shape) for _, shape in both)
-            named = [shape for _, shape in both if shape.primitive is not None]
+            named = [(shape, shape.primitive) for _, shape in both if shape.primitive is not None]
             least = max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k]))
             if len(named) == 2 and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
                 good[k] = both
             if len(named) < 2:
                 tried.pop(k)
                 continue
-            away = [_away(shape, points[tried[k]]) for shape in named]
-            near = np.minimum(*away) <= max(float(shape.noise_distance) for shape in named)
+            away = [distances(primitive, points[tried[k]]) for _, primitive in named]
+            near = np.minimum(*away) <= max(float(shape.noise_distance) for shape, _ in named)
             side[k] = np.where(near, np.argmin(away, axis=0), side[k])
     return good
-
-
-def _away(shape: Shape, points: np.ndarray) -> np.ndarray:
-    """Distance of points from a shape's bounded surface, by a program of one of a few sizes."""
-    padded = np.pad(points, ((0, capacity_for(len(points)) - len(points)), (0, 0)), mode="edge")
-    return np.asarray(_distance(shape.primitive, padded))[: len(points)]
-
-
-@jax.jit
-def _distance(primitive: Primitive, points: Array) -> Array:
-    return primitive.distance(points)
 
 
 def _side(flat: np.ndarray) -> np.ndarray:

@@ -356,7 +356,8 @@ def plan(points: Float[ArrayLike, "N 3"], up: Float[ArrayLike, "3"]) -> np.ndarr
 def png(figure: Any, dpi: int = 110) -> bytes:
     """A figure as PNG; the same figure gives the same bytes."""
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=dpi, metadata={"Software": None})
+    # The default level of compression takes two thirds of the time of drawing, to save a tenth of the bytes.
+    figure.savefig(file, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"compress_level": 3})
     return file.getvalue()
 
 
