@@ -124,6 +124,7 @@ def assembled(
             center=place(axes.T @ (0.5 * (low + high))),
             size=frame.unit * (high - low),
             axes=axes @ turn,
+            # A box has two faces at least, and each edge lies along one of them; what may hide its end is not known here.
             seen=jnp.ones(3, bool),
         )
     length = jnp.sqrt((theta[:3] ** 2).sum())

@@ -59,7 +59,8 @@ def measures(shape: Shape) -> tuple[Measure, ...]:
             corners = np.asarray(body.corners, float)
             edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
             lengths = ((edges[0] + edges[2]) / 2, (edges[1] + edges[3]) / 2)
-            return tuple(Measure(n, v, None) for n, v in zip(("length", "width"), sorted(lengths)[::-1], strict=True))
+            named = zip(("length", "width"), sorted(lengths)[::-1], strict=True)
+            return tuple(Measure(n, v, None, lower_bound=open_end) for n, v in named)
         case Box():
             deviations = [_deviation(shape, f"size_{i}") for i in (1, 2, 3)]
             seen = np.asarray(body.seen, bool)
@@ -77,7 +78,7 @@ def measures(shape: Shape) -> tuple[Measure, ...]:
             found = [Measure("half-angle", float(body.half_angle), _deviation(shape, "half_angle"), angle=True)]
             if low * slope > 1e-3 * high * slope:
                 found.append(Measure("smaller radius", low * slope, None))
-            found.append(Measure("base radius", high * slope, None))
+            found.append(Measure("base radius", high * slope, None, lower_bound=open_end))
             found.append(Measure("height", high - low, None, lower_bound=open_end))
             return tuple(found)
         case Sphere():

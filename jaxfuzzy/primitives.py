@@ -87,7 +87,8 @@ class Box(_Body):
         center: Its center.
         size: Full edge lengths along the rows of `axes`.
         axes: Unit vectors, one a row.
-        seen: Whether each edge was seen to its end; where False its length is a lower bound.
+        seen: Whether each edge was seen to its end; where False its length is a lower bound. `model_cloud` tells, which knows
+            what stands before it; elsewhere nothing is known to hide it.
     """
 
     center: Float[Array, "3"]

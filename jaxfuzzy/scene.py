@@ -17,6 +17,7 @@ from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.matcher import Matcher
+from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
@@ -191,13 +192,16 @@ def _model(
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
+    thickness = 0.0
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
     with clock.stage("ground"):
         if ground is not None:
             found = fit_ground(
                 points, up=vertical, weights=heaviness, depth_std=cloud.depth_std, camera=camera, **known_up
             )
-            kept &= np.asarray(foreground(points, found, up=vertical, weights=heaviness, camera=camera).mask)
+            standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
+            kept &= np.asarray(standing.mask)
+            thickness = float(standing.cut)
             plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
             vertical = vertical if plane is None else np.asarray(plane.normal)
     if isinstance(noise_distance, str) and deviation is not None:
@@ -219,21 +223,24 @@ def _model(
         picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
         parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
         if plane is not None:
-            standing = _standing(np.asarray(points[own]), np.asarray(parts.labels), plane)
-            if not standing.all():
-                own = own[standing]
+            raised = _standing(np.asarray(points[own]), np.asarray(parts.labels), plane)
+            if not raised.all():
+                own = own[raised]
                 parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, **seen(own), **picked)
+        places = np.asarray(points[own])
         if segment_rule == "robust" and "ks" not in options:
-            places = np.asarray(points[own])
 
             def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
                 return fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
 
             across = np.asarray(tangents(jnp.asarray(vertical)))
             parts, shapes = by_shapes(places, across, parts, shapes, fit)
+        if camera is not None:
+            members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(parts.k)]
+            shapes = with_hidden_ends(places, members, shapes, np.asarray(camera), plane, thickness)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,

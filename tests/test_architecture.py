@@ -15,7 +15,8 @@ ORDER = """
     seeding validity density segment meshes primitives refine recover bodies simulate
     objects rays bounds starts local choice candidates screening finalists search polish fitting looks mostpoints shapes groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
-    scene losses tuning sensitivity drawing plot export folder page report table estimators arguments terminal cli __init__
+    occlusion scene losses tuning sensitivity drawing plot export folder page report table estimators arguments terminal
+    cli __init__
 """.split()
 DOORS = {
     "cv2": {"rig", "rigfiles", "stereo", "photos", "calibrate", "matcher", "render", "reproject"},

@@ -1,0 +1,173 @@
+"""Which ends of a shape were seen: an end is hidden where the view just beyond it is blocked by something nearer.
+
+A shape ends where its points end. They may do so because the body does, and then what is seen just beyond lies farther away than
+the body's surface would if it went on, or nothing does. Or something stands in the way, and the body is longer than it looks: its
+size is a lower bound. An end that rests on the ground is seen whatever stands before it, and so is one whose face was seen.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
+from jaxfuzzy.shapes import Shape
+from jaxfuzzy.status import Status
+
+# Points within this share of an extent from its end are asked what is seen beyond; more where points are this sparse.
+STRIP, SPACINGS = 0.1, 3.0
+# So many of them at most, and at least.
+MOST_ASKED, FEWEST_ASKED = 128, 8
+# A view is blocked where so many points are nearer, within the reach of so many points of the sparser of the two: what is looked
+# at and what stands before it. Outliers are so sparse only where they are as many as the points of the shape.
+IN_FRONT, NEIGHBOURS = 4, 8
+# Nearer means by more than so many noise distances.
+CLEARLY = 2.0
+# An end is hidden when more than this share of the views beyond it is blocked.
+BLOCKED = 0.5
+
+
+class Sight(NamedTuple):
+    """Some points as the camera sees them: directions (n, 3), distances (n,), and the reach of `NEIGHBOURS` of them in the view."""
+
+    ray: np.ndarray
+    depth: np.ndarray
+    reach: float
+
+
+class End(NamedTuple):
+    """One end of an extent: which extent it belongs to, a point there, the direction out of the body, the extent's length."""
+
+    extent: int
+    place: np.ndarray
+    outward: np.ndarray
+    length: float
+
+
+def with_hidden_ends(
+    points: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    camera: np.ndarray,
+    ground: Plane | None,
+    thickness: float,
+) -> tuple[Shape, ...]:
+    """Tells for each shape whether its ends were seen: in `Box.seen` and, where one was not, by the status LOWER_BOUND.
+
+    Args:
+        points: The points (N, 3) of all objects, and outliers; not those of the ground.
+        members: Indices of the points of each shape.
+        shapes: The shapes.
+        camera: Where the points were seen from (3,).
+        ground: The plane they stand on.
+        thickness: How far above it points were taken for its own.
+    """
+    offset = np.asarray(points - camera, float)
+    depth = np.linalg.norm(offset, axis=1)
+    ray = offset / np.maximum(depth, 1e-12)[:, None]
+    on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
+    sights = [_sight(ray[own], depth[own]) for own in on]
+    rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
+    told = []
+    for k, shape in enumerate(shapes):
+        # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
+        loose = Sight(ray[rest], depth[rest], sights[k].reach)
+        before = [*(s for i, s in enumerate(sights) if i != k), loose]
+        hidden = {
+            end.extent
+            for end in ends_of(shape.primitive)
+            if not _rests(end, ground, thickness) and _hidden(end, shape, sights[k], before, camera)
+        }
+        if hidden:
+            body = shape.primitive
+            if isinstance(body, Box):
+                seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
+                body = dataclasses.replace(body, seen=jnp.asarray(seen))
+            status = jnp.asarray(int(shape.status) | Status.LOWER_BOUND, jnp.int32)
+            shape = dataclasses.replace(shape, primitive=body, status=status)
+        told.append(shape)
+    return tuple(told)
+
+
+def ends_of(body: Primitive | None) -> list[End]:
+    """The ends of what a body extends over; a sphere and the tip of a cone have none, as they cannot go on."""
+    match body:
+        case Cylinder():
+            base, axis, height = np.asarray(body.base), np.asarray(body.axis), float(body.height)
+            return [End(0, base, -axis, height), End(0, base + height * axis, axis, height)]
+        case Cone():
+            apex, axis, (low, high) = np.asarray(body.apex), np.asarray(body.axis), np.asarray(body.height, float)
+            wide = End(0, apex + high * axis, axis, high - low)
+            return [wide, End(0, apex + low * axis, -axis, high - low)] if low > STRIP * high else [wide]
+        case Box():
+            center, size, axes = np.asarray(body.center), np.asarray(body.size, float), np.asarray(body.axes)
+            return [
+                End(i, center + side * size[i] / 2 * axes[i], side * axes[i], size[i])
+                for i in range(3)
+                for side in (-1, 1)
+            ]
+        case Plane():
+            corners = np.asarray(body.corners)
+            # Each edge with the next one, which leads away from it.
+            leads = np.roll(corners, -1, axis=0) - corners
+            lengths = np.linalg.norm(leads, axis=1)
+            return [End(i % 2, corners[i], -leads[i] / max(lengths[i], 1e-12), float(lengths[i])) for i in range(4)]
+    return []
+
+
+def _rests(end: End, ground: Plane | None, thickness: float) -> bool:
+    """Whether an end stands on the ground, where the body has its points taken away with those of the ground."""
+    if ground is None:
+        return False
+    up = np.asarray(ground.normal)
+    height = float((end.place - np.asarray(ground.point)) @ up)
+    return bool(end.outward @ up < 0 and height < 2 * thickness + STRIP * end.length)
+
+
+def _sight(ray: np.ndarray, depth: np.ndarray) -> Sight:
+    if len(ray) <= NEIGHBOURS:
+        return Sight(ray, depth, 0.0)
+    some = ray[np.linspace(0, len(ray) - 1, min(len(ray), MOST_ASKED)).astype(int)]
+    square = np.maximum(2 - 2 * some @ ray.T, 0)
+    return Sight(ray, depth, float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS]))))
+
+
+def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camera: np.ndarray) -> bool:
+    if sight.reach == 0:
+        return False
+    surface = sight.ray * sight.depth[:, None]
+    # How far inside the end each point is.
+    inside = (end.place - camera - surface) @ end.outward
+    away = float(np.median(sight.depth))
+    width = max(STRIP * end.length, SPACINGS * sight.reach * away / np.sqrt(NEIGHBOURS))
+    asked = np.flatnonzero(inside < width)
+    if len(asked) < FEWEST_ASKED:
+        return False
+    asked = asked[np.linspace(0, len(asked) - 1, min(len(asked), MOST_ASKED)).astype(int)]
+    nearer = np.zeros(len(asked), int)
+    for other in before:
+        reach = max(sight.reach, other.reach)
+        # The surface as far beyond its end as half the strip is wide, or as the other's points tell where it ends.
+        step = np.maximum(inside[asked], 0) + max(width / 2, 0.7 * reach * away)
+        beyond = _moved(shape.primitive, surface[asked], end, step, camera)
+        far = np.linalg.norm(beyond, axis=1)
+        view = beyond / far[:, None]
+        middle = view.mean(axis=0)
+        middle = middle / np.linalg.norm(middle)
+        wide = np.linalg.norm(view - middle, axis=1).max() + reach
+        near = 2 - 2 * other.ray @ middle < wide**2
+        close = 2 - 2 * view @ other.ray[near].T < reach**2
+        in_front = other.depth[near] < far[:, None] - CLEARLY * float(shape.noise_distance)
+        nearer = np.maximum(nearer, (close & in_front).sum(axis=1))
+    return bool((nearer >= IN_FRONT).mean() > BLOCKED)
+
+
+def _moved(body: Primitive | None, own: np.ndarray, end: End, step: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """Points of a surface, from the camera, moved on along it; on a cone along the line to its tip."""
+    if isinstance(body, Cone):
+        tip = np.asarray(body.apex) - camera
+        along = (own - tip) @ end.outward
+        return tip + (own - tip) * (1 + step / np.where(np.abs(along) > 1e-9, along, 1.0))[:, None]
+    return own + step[:, None] * end.outward
