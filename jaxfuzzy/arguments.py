@@ -33,6 +33,7 @@ DEMO = """example:
 MODEL = """examples:
   jaxfuzzy model left.png right.png --rig calib.txt
   jaxfuzzy model left.png right.png --rig rig.json -k 1:4 --kinds box,cylinder --out found
+  jaxfuzzy model left.png right.png --rig intrinsics.yml --rig extrinsics.yml --unit 0.001
   jaxfuzzy model left.png right.png --rig rig.json --json --quiet | jq '.shapes[].kind'"""
 SHAPES = """examples:
   jaxfuzzy shapes cloud.ply
@@ -104,9 +105,14 @@ def _model(command: argparse.ArgumentParser) -> None:
         "--rig",
         type=Path,
         required=True,
+        action="append",
         metavar="FILE",
-        help="the cameras: rig.json of calibrate, Middlebury or KITTI calib.txt, OpenCV yml/xml, ROS camera_info",
+        help="the cameras: rig.json of calibrate, Middlebury or KITTI calib.txt, OpenCV yml/xml, ROS camera_info; "
+        "twice where they are in two files (left and right, or intrinsics and extrinsics)",
     )
+    add("--unit", type=_length, metavar="M", help="unit of that file in metres, such as 0.001 (default: its format's)")
+    add("--rectified", action="store_true", help="the images are rectified though the file describes the raw cameras")
+    add("--arbitrary-units", action="store_true", help="go on where the file holds no baseline; lengths mean nothing then")
     _scene(command)
 
 

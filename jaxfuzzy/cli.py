@@ -74,7 +74,9 @@ def _demo(args: argparse.Namespace) -> int:
 def _model(args: argparse.Namespace) -> int:
     from jaxfuzzy.rig import load_rig
 
-    rig = load_rig(args.rig)
+    if len(args.rig) > 2:
+        raise ValueError(f"--rig takes one or two files, got {len(args.rig)}")
+    rig = load_rig(*args.rig, unit_m=args.unit, rectified=args.rectified, arbitrary_units=args.arbitrary_units)
     return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **options))
 
 

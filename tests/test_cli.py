@@ -174,6 +174,7 @@ def test_bad_stereo_input(run, tmp_path):
         (("left.png", "right.png", "--rig", "missing.json"), "rig not found: missing.json"),
         (("left.png", "right.png", "--rig", "calib.txt"), "holds no baseline"),
         (("left.png", "right.png", "--rig", "text.json"), "rig text.json"),
+        (("left.png", "right.png", *("--rig", "rig.json") * 3), "--rig takes one or two files, got 3"),
         (
             ("left.png", "right.png", "--rig", "rig.json", "--out", "left.png"),
             "out must be a folder, got the file left.png",
@@ -188,6 +189,29 @@ def test_bad_stereo_input(run, tmp_path):
         assert (status, out) == (2, ""), err
         assert message in last_line(err)
         assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_rig_in_two_files_and_another_unit(run, monkeypatch):
+    from jaxfuzzy import scene
+    from jaxfuzzy.checks import DataError
+
+    rigs = []
+
+    def model_scene(left, right, rig, **_):
+        rigs.append(rig)
+        raise DataError("seen enough")
+
+    monkeypatch.setattr(scene, "model_scene", model_scene)
+    camera = "%YAML:1.0\n---\nM{0}: [[60, 0, 32], [0, 60, 24], [0, 0, 1]]\nD{0}: [0, 0, 0, 0, 0]\n"
+    Path("intrinsics.yml").write_text(camera.format(1) + camera.format(2).removeprefix("%YAML:1.0\n---\n"))
+    Path("extrinsics.yml").write_text("%YAML:1.0\n---\nR: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\nT: [-120, 0, 0]\n")
+    words = ("model", "left.png", "right.png", "--rig", "intrinsics.yml", "--rig", "extrinsics.yml", "--unit", "0.001")
+    assert run(*words)[0] == 1
+    assert not rigs[0].rectified
+    assert abs(rigs[0].baseline_m - 0.12) < 1e-12
+    Path("calib.txt").write_text("cam0=[60 0 32; 0 60 24; 0 0 1]\n")
+    assert run("model", "left.png", "right.png", "--rig", "calib.txt", "--arbitrary-units")[0] == 1
+    assert not rigs[1].metric
 
 
 def test_pairs_that_do_not_agree(run, tmp_path):
