@@ -112,7 +112,11 @@ def _model(command: argparse.ArgumentParser) -> None:
     )
     add("--unit", type=_length, metavar="M", help="unit of that file in metres, such as 0.001 (default: its format's)")
     add("--rectified", action="store_true", help="the images are rectified though the file describes the raw cameras")
-    add("--arbitrary-units", action="store_true", help="go on where the file holds no baseline; lengths mean nothing then")
+    add(
+        "--arbitrary-units",
+        action="store_true",
+        help="go on where the file holds no baseline; lengths mean nothing then",
+    )
     _scene(command)
 
 

@@ -10,7 +10,7 @@ from jax import lax
 
 from jaxfuzzy import bounds, polish, rays, search
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.objects import Frame, capacity_for
+from jaxfuzzy.objects import MOST, Frame, Prepared, capacity_for
 from jaxfuzzy.primitives import Primitive
 
 FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
@@ -96,6 +96,54 @@ def _view(item: dict[str, Array], along_ray: bool) -> rays.View:
     if not along_ray:
         return rays.View(point, None, None, gain, mask)
     return rays.View(point, item["rays"][None], item["eye"][None], gain, mask)
+
+
+class Judged(NamedTuple):
+    """All points of an object beside its surface, in the order of the search.
+
+    Attributes:
+        square: Squared residual in deviations (N,).
+        depth: From each along its ray to the surface (N,).
+        part: Which part of the surface each met (N,).
+    """
+
+    square: np.ndarray
+    depth: np.ndarray
+    part: np.ndarray
+
+
+def judged(item: Prepared, fitted: Fitted, along_ray: bool) -> Judged:
+    """What the fit says of the points it was made to, and for a larger object of all others too."""
+    n, polished, dtype = len(item.points), fitted.polished, fitted.polished.theta.dtype
+    if n <= len(polished.square):
+        return Judged(*(np.asarray(a)[:n] for a in (polished.square, polished.depth, polished.part)))
+    pieces = []
+    for start in range(0, n, MOST):
+        own = slice(start, start + MOST)
+        fill = lambda a: np.pad(a, ((0, MOST - len(a)), *((0, 0),) * (a.ndim - 1)), mode="edge").astype(dtype)
+        points, rays_, gain = (fill(a[own]) for a in (item.points, item.rays, item.gain))
+        surface = (np.asarray(FAMILIES)[fitted.kind], polished.theta, polished.turn, fitted.detail)
+        pieces.append(_judge(*surface, points.T, rays_.T, item.eye.astype(dtype), gain / fitted.deviation, along_ray))
+    return Judged(*(np.concatenate(a)[:n] for a in zip(*jax.device_get(pieces), strict=True)))
+
+
+@partial(jax.jit, static_argnames="along_ray")
+def _judge(
+    family: Array,
+    theta: Array,
+    turn: Array,
+    detail: Array,
+    points: Array,
+    directions: Array,
+    eye: Array,
+    gain: Array,
+    along_ray: bool,
+) -> tuple[Array, Array, Array]:
+    item = {"points": points, "rays": directions, "eye": eye, "gain": gain, "weight": jnp.ones_like(gain)}
+    view = _view(item, along_ray)
+    met = polish.met_by(family, theta, turn, detail, view)
+    residual = polish.residual_of(family, theta, turn, detail, view, met)
+    return (residual.error**2 + residual.miss**2)[0], met.depth[0], met.part[0]
 
 
 @partial(jax.jit, static_argnames="kind")

@@ -14,7 +14,6 @@ import numpy as np
 
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
-from jaxfuzzy.objects import capacity_for
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
@@ -43,7 +42,7 @@ def by_shapes(
         across: The two directions (2, 3) of the plane objects stand on.
         parts: Their division by places.
         shapes: The shape of each group.
-        fit: Fits shapes to sets of points given by their indices, compiled for so many points an object at least.
+        fit: Fits shapes to sets of points given by their indices, by the program compiled for so many points an object.
 
     Returns:
         The division and the shapes that came of it; the same records where nothing changed.
@@ -52,7 +51,7 @@ def by_shapes(
     members = [np.flatnonzero(labels == k) for k in range(parts.k)]
     largest = max(map(len, members), default=1)
     flat = points @ across.T
-    joined = _joined(points, flat, members, shapes, fit, largest)
+    joined = _joined(flat, members, shapes, fit, largest)
     divided = _divided(points, flat, members, shapes, {i for pair in joined for i in pair}, fit, largest)
     if not joined and not divided:
         return parts, shapes
@@ -72,7 +71,6 @@ def _held(shape: Shape) -> float:
 
 
 def _joined(
-    points: np.ndarray,
     flat: np.ndarray,
     members: Sequence[np.ndarray],
     shapes: Sequence[Shape],
@@ -90,9 +88,7 @@ def _joined(
         if a < b
     }
     pairs = sorted((p for p in apart if apart[p] < NEAR), key=apart.__getitem__)[:MOST_PAIRS]
-    # A merged group must not need a larger program than the one compiled.
-    most = capacity_for(largest)
-    both = [_thinned(np.sort(np.concatenate([members[a], members[b]])), most) for a, b in pairs]
+    both = [np.sort(np.concatenate([members[a], members[b]])) for a, b in pairs]
     good: list[tuple[float, tuple[int, int], tuple[np.ndarray, Shape]]] = []
     for (a, b), own, shape in zip(pairs, both, fit(both, largest) if both else (), strict=True):
         if shape.primitive is None:
@@ -100,8 +96,7 @@ def _joined(
         held = own[np.asarray(shape.inliers)]
         shares = []
         for k in (a, b):
-            present = np.isin(own, members[k]).sum() / len(members[k])
-            part = np.isin(held, members[k]).sum() / max(present, 1e-12)
+            part = np.isin(held, members[k]).sum()
             alone = _held(shapes[k])
             shares.append(part / (HOLDS * alone if alone else HOLDS_OF_ALL * len(members[k])))
         if min(shares) >= 1:
@@ -110,23 +105,7 @@ def _joined(
     for _, pair, found in sorted(good, key=lambda g: -g[0]):
         if not {i for p in chosen for i in p} & set(pair):
             chosen[pair] = found
-    return {pair: _whole(points, members, pair, *found) for pair, found in chosen.items()}
-
-
-def _whole(
-    points: np.ndarray, members: Sequence[np.ndarray], pair: tuple[int, int], own: np.ndarray, shape: Shape
-) -> tuple[np.ndarray, Shape]:
-    """The same for all points of a pair, where some were left out: those count by their orthogonal distance."""
-    every = np.sort(np.concatenate([members[k] for k in pair]))
-    if len(own) == len(every) or shape.primitive is None:
-        return own, shape
-    inliers = distances(shape.primitive, points[every]) <= float(shape.noise_distance)
-    inliers[np.isin(every, own)] = np.asarray(shape.inliers)
-    return every, dataclasses.replace(shape, inliers=jnp.asarray(inliers))
-
-
-def _thinned(own: np.ndarray, most: int) -> np.ndarray:
-    return own if len(own) <= most else own[np.linspace(0, len(own) - 1, most).astype(int)]
+    return chosen
 
 
 def _divided(

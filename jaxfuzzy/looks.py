@@ -59,6 +59,11 @@ class Look(NamedTuple):
     reason: Status
 
     @property
+    def fitted_to(self) -> int:
+        """How many of its points it was fitted to."""
+        return min(len(self.item.points), len(self.fitted.polished.square))
+
+    @property
     def noise(self) -> float:
         """Noise of the surface found, in the object's unit."""
         return float(self.fitted.polished.scale * self.fitted.deviation * np.median(1 / self.item.gain))
@@ -66,7 +71,8 @@ class Look(NamedTuple):
     @property
     def score(self) -> float:
         """Score of the surface, made independent of what deviation it was searched with."""
-        logs = self.item.weight @ np.log(self.item.gain / self.fitted.deviation)
+        n = self.fitted_to
+        logs = self.item.weight[:n] @ np.log(self.item.gain[:n] / self.fitted.deviation)
         return float(self.fitted.scores[self.fitted.kind] - logs)
 
 
@@ -129,12 +135,13 @@ def _reason(look: Look) -> Status:
     item, p = look.item, look.fitted.polished
     if not look.fitted.passed.any() or not np.isfinite(p.theta).all():
         return Status.REFUSED
-    distance = np.sqrt(p.square[: len(item.points)]) / max(1.0, p.scale)
-    on = item.weight @ (distance <= DEVIATIONS)
-    if look.noise > HOPELESS or on < max(FEWEST / 2, LEAST_SHARE * item.weight.sum()):
+    weight = item.weight[: look.fitted_to]
+    distance = np.sqrt(p.square[: look.fitted_to]) / max(1.0, p.scale)
+    on = weight @ (distance <= DEVIATIONS)
+    if look.noise > HOPELESS or on < max(FEWEST / 2, LEAST_SHARE * weight.sum()):
         return Status.ALL_NOISE | Status.REFUSED
     misfit = look.noise / look.expected
-    near = item.weight @ ((distance > DEVIATIONS) & (distance < 6.0)) / (item.weight @ (distance < 6.0))
+    near = weight @ ((distance > DEVIATIONS) & (distance < 6.0)) / (weight @ (distance < 6.0))
     suspect = misfit > SUSPECT and near > NEAR and look.noise > BULGE
     return Status.REFUSED if misfit > MISFIT or suspect else Status(0)
 

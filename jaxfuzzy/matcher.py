@@ -23,7 +23,8 @@ class Matcher:
         block: Side of the matched block, odd. Larger ones fatten edges ("bm" uses at least 15).
         smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block.
         uniqueness: By how many per cent the best match must beat the second.
-        left_right_px: Largest difference between matching left to right and right to left; None leaves the check out.
+        left_right_px: Largest difference between matching left to right and right to left, the compared block wholly within both
+            images' sides; None leaves the check out.
         speckle_px: Connected patches of at most so many pixels are removed; 0 keeps them.
         edge_px: Pixels to erode from the nearer side of a depth edge, where matching bleeds over; 0 keeps them.
         refine: Refine the matcher's sixteenths of a pixel by the images' gradients, without which clouds come in layers;

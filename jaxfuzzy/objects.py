@@ -13,8 +13,10 @@ import numpy as np
 
 # A noise distance is so many standard deviations; residuals are searched and weighed in deviations.
 DEVIATIONS = 2.5
-# Sizes that are compiled: points an object (beyond, powers of two) and objects a batch; an object that is not there costs nothing.
+# Sizes that are compiled: points an object and objects a batch; an object that is not there costs nothing.
 CAPACITIES = (2048, 8192)
+# An object is fitted to so many of its points, evenly drawn: errors of stereo are alike over tens of pixels, so more say no more.
+MOST = CAPACITIES[-1]
 BATCH = 16
 GOLDEN = 0.6180339887498949
 
@@ -123,7 +125,7 @@ def upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
 
 
 def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, np.ndarray]:
-    """One padded batch: weight 0 and a finite filler where there is no point."""
+    """One padded batch: weight 0 and a finite filler where there is no point; of larger objects a fair sample."""
     count = BATCH
     batch = {
         "points": np.zeros((count, 3, capacity), dtype),
@@ -135,9 +137,9 @@ def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, n
         "given": np.ones(count, bool),
     }
     for i, o in enumerate(items):
-        n = len(o.points)
-        batch["points"][i, :, :n], batch["rays"][i, :, :n] = o.points.T, o.rays.T
-        batch["gain"][i, :n], batch["weight"][i, :n] = o.gain, o.weight
+        n = min(len(o.points), capacity)
+        batch["points"][i, :, :n], batch["rays"][i, :, :n] = o.points[:n].T, o.rays[:n].T
+        batch["gain"][i, :n], batch["weight"][i, :n] = o.gain[:n], o.weight[:n]
         batch["eye"][i], batch["depth_range"][i], batch["given"][i] = o.eye, o.depth_range, o.given
     return batch
 

@@ -97,33 +97,11 @@ def polish(
     free, dtype = candidate.free, view.gain.dtype
     prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / LEAN_PRIOR**2 * free
 
-    detail = candidate.detail[None]
-
     def meet(theta: Array, turn: Array) -> Meeting:
-        seen, ends = rays.turned(view, turn[None]), None if view.ray is None else detail
-        families = (
-            lambda t: rays.meet_plane(t, seen),
-            lambda t: rays.meet_box(t, detail, seen),
-            lambda t: rays.meet_revolution(t, ends, seen),
-            lambda t: rays.meet_sphere(t, ends, seen),
-        )
-        return lax.switch(family, families, theta[None])
-
-    def residual(theta: Array, turn: Array, met: Meeting) -> Residual:
-        seen = rays.turned(view, turn[None])
-        families = (
-            lambda t: rays.plane(t, seen, met),
-            lambda t: rays.box(t, detail, seen, met),
-            lambda t: rays.revolution(t, seen, met),
-            lambda t: rays.sphere(t, seen, met),
-        )
-        full = lambda f: (
-            lambda t: jax.tree.map(lambda a: jnp.broadcast_to(jnp.asarray(a, dtype), met.depth.shape), f(t))
-        )
-        return lax.switch(family, [full(f) for f in families], theta[None])
+        return met_by(family, theta, turn, candidate.detail, view)
 
     def look(state: _State) -> _Look:
-        r = residual(state.theta, state.turn, state.met)
+        r = residual_of(family, state.theta, state.turn, candidate.detail, view, state.met)
         square, scale = (r.error**2 + r.miss**2)[0], state.scale
         on = -0.5 * (square / scale**2 + jnp.log(r.variance[0])) - jnp.log(scale) - HALF_LOG_2PI
         odds = on + jnp.log1p(-state.background) - jnp.log(state.background) - outside
@@ -180,3 +158,31 @@ def polish(
         part=end.met.part[0],
         moved=end.moved,
     )
+
+
+def met_by(family: Array, theta: Array, turn: Array, detail: Array, view: View) -> Meeting:
+    """Where one surface of a family known only at run time meets the rays (1, N)."""
+    seen, signs = rays.turned(view, turn[None]), detail[None]
+    ends = None if view.ray is None else signs
+    families = (
+        lambda t: rays.meet_plane(t, seen),
+        lambda t: rays.meet_box(t, signs, seen),
+        lambda t: rays.meet_revolution(t, ends, seen),
+        lambda t: rays.meet_sphere(t, ends, seen),
+    )
+    return lax.switch(family, families, theta[None])
+
+
+def residual_of(family: Array, theta: Array, turn: Array, detail: Array, view: View, met: Meeting) -> Residual:
+    """How far the points lie from that surface (1, N)."""
+    seen, signs = rays.turned(view, turn[None]), detail[None]
+    families = (
+        lambda t: rays.plane(t, seen, met),
+        lambda t: rays.box(t, signs, seen, met),
+        lambda t: rays.revolution(t, seen, met),
+        lambda t: rays.sphere(t, seen, met),
+    )
+    full = lambda f: (
+        lambda t: jax.tree.map(lambda a: jnp.broadcast_to(jnp.asarray(a, view.gain.dtype), met.depth.shape), f(t))
+    )
+    return lax.switch(family, [full(f) for f in families], theta[None])

@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxfuzzy import bounds, checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
-from jaxfuzzy.fitting import TOLERANCES, Fitted, assemble_batch
+from jaxfuzzy.fitting import TOLERANCES, Fitted, Judged, assemble_batch, judged
 from jaxfuzzy.looks import Look, Settings, look_at, unfit
 from jaxfuzzy.mostpoints import most_points
-from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches, capacity_for, prepared
+from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
@@ -184,7 +184,8 @@ def fit_members(
         distance: See there.
         rule: See there.
         weights: See there.
-        capacity: At least so many points an object are compiled for, so that a later call can use what an earlier one compiled.
+        capacity: Points an object of the earlier call whose compiled program is to be used again; 0 to choose by the sets. Larger
+            sets are fitted to a fair sample, and all their points judged.
     """
     array = checks.places(points)
     count = len(array)
@@ -211,7 +212,7 @@ def fit_members(
     poor = [unfit(o) for o in objects]
     good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
     most = max((len(o.points) for o in good), default=1)
-    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype, capacity_for(max(most, capacity)))
+    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype, capacity_for(min(capacity or most, MOST)))
     fit = [i for i, status in enumerate(poor) if not status]
     looks = dict(zip(fit, look_at(good, settings), strict=True))
     if rule != "paper":
@@ -280,15 +281,16 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
     """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
     good = {i: look for i, look in looks.items() if not look.reason}
+    seen = {i: judged(look.item, look.fitted, settings.along_ray) for i, look in good.items()}
     made: dict[int, tuple[Primitive, np.ndarray]] = {}
     for kind in KINDS:
         same = {i: o for i, o in good.items() if KINDS[o.fitted.kind] == kind}
         for part in batches(list(same)):
-            made |= _assembled(kind, {i: same[i] for i in part}, settings.dtype)
+            made |= _assembled(kind, {i: same[i] for i in part}, seen, settings.dtype)
     arrays, rest = [], []
     for i, size in enumerate(sizes):
         if i in made:
-            own, told = _named(looks[i], *made[i], settings)
+            own, told = _named(looks[i], seen[i], *made[i], settings)
         else:
             own, told = _unknown(size, looks.get(i), Status(poor[i] or looks[i].reason), settings)
         arrays.append(own)
@@ -296,27 +298,28 @@ def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settin
     return tuple(Shape(**own, **told) for own, told in zip(jax.device_put(arrays), rest, strict=True))
 
 
-def _on(look: Look) -> np.ndarray:
+def _on(look: Look, seen: Judged) -> np.ndarray:
     """Which points lie on the surface, in the order of the search: those whose noise membership is not the larger."""
     scale = 1.0 if look.item.given else float(look.fitted.polished.scale)
-    n = len(look.item.points)
-    return (np.asarray(look.fitted.polished.square)[:n] <= (DEVIATIONS * scale) ** 2) & (look.item.weight > 0)
+    return (seen.square <= (DEVIATIONS * scale) ** 2) & (look.item.weight > 0)
 
 
-def _ends(look: Look) -> np.ndarray:
+def _ends(look: Look, seen: Judged) -> np.ndarray:
     item, polished = look.item, look.fitted.polished
-    n = len(item.points)
-    hits = (item.points + polished.depth[:n, None] * item.rays) @ polished.turn.T
+    hits = (item.points + seen.depth[:, None] * item.rays) @ polished.turn.T
     kind = KINDS[look.fitted.kind]
-    theta, part, detail = map(np.asarray, (polished.theta, polished.part[:n], look.fitted.detail))
-    return bounds.ends_of(kind, theta, hits, part, _on(look), detail)
+    return bounds.ends_of(
+        kind, np.asarray(polished.theta), hits, seen.part, _on(look, seen), np.asarray(look.fitted.detail)
+    )
 
 
-def _assembled(kind: str, looks: dict[int, Look], dtype: Any) -> dict[int, tuple[Primitive, np.ndarray]]:
+def _assembled(
+    kind: str, looks: dict[int, Look], seen: dict[int, Judged], dtype: Any
+) -> dict[int, tuple[Primitive, np.ndarray]]:
     """Primitives of one kind and their covariances, padded by repetition to one compiled size."""
     chosen = list(looks)
     rows = chosen + [chosen[0]] * (BATCH - len(chosen))
-    ends = {i: _ends(look) for i, look in looks.items()}
+    ends = {i: _ends(look, seen[i]) for i, look in looks.items()}
     stack = lambda of: np.stack([np.asarray(of(i), dtype) for i in rows])
     frame = Frame(*(stack(lambda i, f=f: getattr(looks[i].item.frame, f)) for f in Frame._fields))
     polished = lambda name: stack(lambda i: getattr(looks[i].fitted.polished, name))
@@ -327,13 +330,13 @@ def _assembled(kind: str, looks: dict[int, Look], dtype: Any) -> dict[int, tuple
 
 
 def _named(
-    look: Look, primitive: Primitive, covariance: np.ndarray, settings: Settings
+    look: Look, seen: Judged, primitive: Primitive, covariance: np.ndarray, settings: Settings
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The fields of a shape that has a name: those that are arrays, and the rest."""
     item, fitted = look.item, look.fitted
     kind = KINDS[fitted.kind]
     inliers = np.zeros(len(item.points), bool)
-    inliers[item.order] = _on(look)
+    inliers[item.order] = _on(look, seen)
     scores, margin, guards = _told(fitted, settings.kinds)
     status = Status.MAY_BE_BOX if kind == "plane" else Status(0)
     if margin < NARROW:

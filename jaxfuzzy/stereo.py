@@ -99,10 +99,10 @@ def disparity(
         raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
     low, count = search_range(left, right, rig, matcher)
     values = _match(left, right, low, count, matcher)
-    valid = (values >= low) & (values + rig.doffs_px > 0) & _textured(left) & _whole_blocks(values, matcher)
+    valid = (values >= low) & (values + rig.doffs_px > 0) & _textured(left)
     if matcher.left_right_px is not None:
         mirrored = _match(right[:, ::-1], left[:, ::-1], low, count, matcher)[:, ::-1]
-        valid &= _agrees(values, mirrored, low, matcher.left_right_px)
+        valid &= _agrees(values, mirrored, low, matcher.left_right_px) & _whole_blocks(values, matcher)
     if matcher.edge_px:
         valid &= ~_edges(values, valid, matcher.edge_px)
     if matcher.speckle_px:

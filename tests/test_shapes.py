@@ -6,7 +6,7 @@ The search compiles once for double precision with a camera and once for single 
 import numpy as np
 import pytest
 
-from jaxfuzzy.shapes import fit_shape, fit_shapes
+from jaxfuzzy.shapes import fit_members, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
 from jaxfuzzy.status import Status
 
@@ -177,6 +177,19 @@ def test_points_with_their_own_deviations_count_by_them():
     assert abs(float(known.primitive.radius - cloud.truths[0].primitive.radius)) < 4 * deviation
     # Half the points ten times as noisy: weighing all alike costs several times in the radius' error bar.
     assert 2 * deviation < np.sqrt(np.diag(np.asarray(same.covariance)))[-1]
+
+
+def test_large_objects_are_fitted_to_a_sample_and_judged_whole():
+    """The program of 2,048 points; the truth says of every point whether it lies on the body."""
+    cloud = simulate_object("cylinder", 61, outliers=0.1, points=(5000, 5000))
+    everything = [np.arange(len(cloud.points))]
+    noise = SIGMAS * cloud.depth_std
+    (shape,) = fit_members(cloud.points, everything, camera=CAMERA, noise_distance=noise, capacity=2048)
+    assert shape.kind == "cylinder"
+    deviation = np.sqrt(np.diag(np.asarray(shape.covariance)))[-1]
+    assert abs(float(shape.primitive.radius - cloud.truths[0].primitive.radius)) < 4 * deviation
+    # 2.5 deviations leave 1.2 % of the good points out; an outlier on the surface by chance is in.
+    assert (np.asarray(shape.inliers) == (cloud.labels >= 0)).mean() > 0.95
 
 
 def test_single_precision_without_a_camera_agrees_with_double(clouds):
