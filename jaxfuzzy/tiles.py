@@ -136,7 +136,7 @@ def tile_points(
     own = count if parts is None else -(-count // parts.count)
     # A power of two: matrix products with other numbers of rows took three to five times as long on a CPU.
     rows = min(max(256, 1 << ((TILE_VALUES // clusters).bit_length() - 1)), own)
-    lay = partial(_lay_out, mean=mean, scale=scale, rows=-(-rows // 8) * 8)
+    lay = partial(_lay_out, mean, scale, -(-rows // 8) * 8, parts)
     if parts is None:
         blocks, weights = lay(points, weights)
     else:
@@ -144,7 +144,11 @@ def tile_points(
     return Tiles(blocks, weights, mean, scale, spread, present, count, parts)
 
 
-def _lay_out(points: Array, weights: Array, mean: Array, scale: Array, rows: int) -> tuple[Array, Array]:
+def _lay_out(
+    mean: Array, scale: Array, rows: int, parts: Parts | None, points: Array, weights: Array
+) -> tuple[Array, Array]:
+    if parts is not None:
+        mean, scale = lax.pcast((mean, scale), parts.axes, to="varying")
     weights = _cut(weights[:, None], rows)[:, 0]
     return _design(points, weights, mean, scale), weights
 
