@@ -22,6 +22,14 @@ FEWEST = 12
 # just off it, between one and 2.4 noise distances, and the noise is more than real boxes and tins bulge and dent, as a share
 # of the object's spread. Measured on simulated clouds of 0.5 to 3 mm noise: right ones stay below 1.25.
 MISFIT, SUSPECT, NEAR, BULGE = 1.9, 1.35, 0.06, 0.055
+# Just off a surface: up to so many deviations.
+FAR = 6.0
+# Share of points between one and 2.4 given noise distances of the surface, less what uniform outliers explain, from which on it is
+# refused. On simulated clouds with up to 70 % outliers right surfaces stay below 0.18, and below 0.25 with half the true noise
+# distance; of wrong ones for what is no primitive 92 to 100 % are above.
+BEYOND = 0.25
+# Scatter within small windows over the deviation given from which on that is said to be too small.
+SCATTERED = 2.0
 # Noise over spread of the points from which on there is no surface to speak of.
 HOPELESS = 0.35
 # Least share of an object's points that must lie on its surface.
@@ -67,6 +75,11 @@ class Look(NamedTuple):
     def noise(self) -> float:
         """Noise of the surface found, in the object's unit."""
         return float(self.fitted.polished.scale * self.fitted.deviation * np.median(1 / self.item.gain))
+
+    @property
+    def scattered(self) -> Status:
+        """Whether even small windows say that the given deviation is too small."""
+        return Status.SCATTERED if self.item.given and self.fitted.local > SCATTERED else Status(0)
 
     @property
     def score(self) -> float:
@@ -140,10 +153,22 @@ def _reason(look: Look) -> Status:
     on = weight @ (distance <= DEVIATIONS)
     if look.noise > HOPELESS or on < max(FEWEST / 2, LEAST_SHARE * weight.sum()):
         return Status.ALL_NOISE | Status.REFUSED
+    if item.given and _beyond(look) > BEYOND:
+        return Status.REFUSED | look.scattered
     misfit = look.noise / look.expected
-    near = weight @ ((distance > DEVIATIONS) & (distance < 6.0)) / (weight @ (distance < 6.0))
+    near = weight @ ((distance > DEVIATIONS) & (distance < FAR)) / (weight @ (distance < FAR))
     suspect = misfit > SUSPECT and near > NEAR and look.noise > BULGE
-    return Status.REFUSED if misfit > MISFIT or suspect else Status(0)
+    return Status.REFUSED | look.scattered if misfit > MISFIT or suspect else Status(0)
+
+
+def _beyond(look: Look) -> float:
+    """Share of the points near a surface that lie just off it, in given noise distances, less that of uniform outliers."""
+    item, p = look.item, look.fitted.polished
+    weight, distance = item.weight[: look.fitted_to], np.sqrt(p.square[: look.fitted_to])
+    on = weight @ (distance <= DEVIATIONS)
+    near = weight @ ((distance > DEVIATIONS) & (distance < FAR))
+    stray = p.background * weight.sum() * 2 * (FAR - DEVIATIONS) / (item.depth_range * np.median(item.gain))
+    return float((near - stray) / max(near + on, 1e-12))
 
 
 def _with_noise_found(look: Look) -> Prepared:

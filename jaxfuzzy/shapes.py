@@ -338,7 +338,7 @@ def _named(
     inliers = np.zeros(len(item.points), bool)
     inliers[item.order] = _on(look, seen)
     scores, margin, guards = _told(fitted, settings.kinds)
-    status = Status.MAY_BE_BOX if kind == "plane" else Status(0)
+    status = look.scattered | (Status.MAY_BE_BOX if kind == "plane" else Status(0))
     if margin < NARROW:
         status |= Status.LOW_MARGIN
     if fitted.polished.moved > TOLERANCES[np.dtype(settings.dtype)]:

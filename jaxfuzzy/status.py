@@ -39,6 +39,7 @@ class Status(enum.IntFlag):
     FLAT_LOSS = 1 << 24
     STALLED = 1 << 25
     RAN_AWAY = 1 << 26
+    SCATTERED = 1 << 27
 
 
 SENTENCES: dict[Status, str] = {
@@ -75,6 +76,8 @@ SENTENCES: dict[Status, str] = {
     " elsewhere.",
     Status.RAN_AWAY: "Tuning drove a value far from its start, where the loss still falls: it has no minimum in a useful range;"
     " bound the value, or use another loss.",
+    Status.SCATTERED: "Points scatter more than twice as much as noise_distance says, even within small windows: raise it if it is"
+    " too small.",
 }
 
 

@@ -101,6 +101,21 @@ def test_what_is_none_of_the_five_is_refused(clouds, batch):
         assert int(shape.status) & Status.REFUSED
 
 
+def test_wrong_surfaces_are_told_by_the_points_just_off_them():
+    """Half outliers hide that nothing fits: eleven of thirty-two such clouds were named before this was looked at."""
+    none = [simulate_object(kind, 900 + i, outliers=0.5) for kind in ("torus", "saddle", "blob") for i in range(4)]
+    right = [simulate_object(kind, 900, outliers=0.5) for kind in KINDS]
+    points, labels, noise = together([*none, *right])
+    shapes = fit_shapes(points, labels, camera=CAMERA, noise_distance=noise)
+    assert sum(shape.kind in ("unknown", "quadric") for shape in shapes[:12]) >= 11
+    for cloud, shape in zip(right, shapes[12:], strict=True):
+        assert shape.kind in cloud.truths[0].answers
+        assert not shape.status & Status.SCATTERED
+    # A noise distance a third of the true one: nothing is named, and why is said.
+    few = fit_shapes(points, labels, camera=CAMERA, noise_distance=noise / 3)[12:]
+    assert all(shape.kind == "unknown" and shape.status & Status.SCATTERED for shape in few)
+
+
 def test_bad_objects_are_told_alone_and_in_a_batch(batch):
     for (points, status), inside in zip(bad_objects().values(), batch[-4:], strict=True):
         alone = fit_shape(points, camera=CAMERA, noise_distance=SIGMAS * 0.001)
