@@ -1,7 +1,8 @@
 """From groups to objects, by their shapes: parts of one body merged, bodies that touch told apart.
 
 Places alone cannot tell: the inner wall of a vessel stands apart from the outer one, an occluder cuts a body in two, and
-bodies that touch are one group. A joint fit can: where one surface holds nearly as many points of two groups as a surface each
+bodies that touch are one group. Two bodies cannot fill the same space, so what lies inside a round body is part of it, its inner
+wall or floor. For the rest a joint fit tells: where one surface holds nearly as many points of two groups as a surface each
 does, it needs half the parameters and they are one object; where two surfaces hold clearly more points of a group than one, they
 are two.
 """
@@ -14,13 +15,18 @@ import numpy as np
 
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
+from jaxfuzzy.primitives import Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
 Fit = Callable[[Sequence[np.ndarray], int], tuple[Shape, ...]]
 
-# Only neighbours are tried together: centers nearer than this share of the sum of their reaches; and so many pairs at most.
-NEAR, MOST_PAIRS = 1.0, 16
+# Of a group that is part of a round body, this share lies inside it, or outside by so many noise distances; so does this share
+# of the body's own group, of which the second share at least must lie on its surface.
+INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
+# Only neighbours are tried together: centers nearer than this share of the sum of their reaches, or than the second one where
+# something hides most of so many places on the way between them; and so many pairs at most.
+NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 5, 16
 # Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
 HOLDS, HOLDS_OF_ALL = 0.9, 0.7
 # A group of which one surface holds this share is one object. Two surfaces must hold this share of the others, and this much
@@ -33,7 +39,12 @@ PLACES = 1024
 
 
 def by_shapes(
-    points: np.ndarray, across: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit
+    points: np.ndarray,
+    across: np.ndarray,
+    parts: Segmentation,
+    shapes: tuple[Shape, ...],
+    fit: Fit,
+    camera: np.ndarray | None = None,
 ) -> tuple[Segmentation, tuple[Shape, ...]]:
     """Merges and divides groups where their shapes say so.
 
@@ -43,16 +54,18 @@ def by_shapes(
         parts: Their division by places.
         shapes: The shape of each group.
         fit: Fits shapes to sets of points given by their indices, by the program compiled for so many points an object.
+        camera: Where the points were seen from (3,).
 
     Returns:
         The division and the shapes that came of it; the same records where nothing changed.
     """
-    labels = np.asarray(parts.labels)
-    members = [np.flatnonzero(labels == k) for k in range(parts.k)]
-    largest = max(map(len, members), default=1)
+    largest = int(np.bincount(np.asarray(parts.labels) + 1, minlength=2)[1:].max())
+    parts, shapes, gathered = _gathered(points, parts, shapes, fit, largest)
+    members = _members(parts)
     flat = points @ across.T
-    joined = _joined(flat, members, shapes, fit, largest)
-    divided = _divided(points, flat, members, shapes, {i for pair in joined for i in pair}, fit, largest)
+    joined = _joined(points, flat, members, shapes, fit, largest, camera)
+    taken = gathered.union(*joined)
+    divided = _divided(points, flat, members, shapes, taken, fit, largest)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []
@@ -66,16 +79,84 @@ def by_shapes(
     return _rebuilt(points, parts, groups, into), tuple(shape for _, shape, _ in groups)
 
 
+def _members(parts: Segmentation) -> list[np.ndarray]:
+    labels = np.asarray(parts.labels)
+    return [np.flatnonzero(labels == k) for k in range(parts.k)]
+
+
+def _gathered(
+    points: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit, largest: int
+) -> tuple[Segmentation, tuple[Shape, ...], set[int]]:
+    """Merges groups into the round body that they lie inside: the new division, its shapes, and which of them are merged ones."""
+    members = _members(parts)
+    into = _contained(points, members, shapes)
+    if not into:
+        return parts, shapes, set()
+    whole = {
+        a: np.sort(np.concatenate([members[a], *(members[b] for b in into if into[b] == a)])) for a in into.values()
+    }
+    groups: list[tuple[np.ndarray, Shape, int]] = []
+    anew = dict(zip(whole, fit(list(whole.values()), largest), strict=True))
+    for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
+        if k in whole:
+            # The outside names the body, unless a surface sought on the whole holds more of the outside too.
+            outside = _extended(points, whole[k], own, shape)
+            joint = anew[k]
+            on_own = np.isin(whole[k][np.asarray(joint.inliers)], own).sum()
+            better = on_own > _held(shape) or (joint.kind == shape.kind and _held(joint) > _held(outside))
+            groups.append((whole[k], joint if better else outside, k))
+        elif k not in into:
+            groups.append((own, shape, k))
+    merged = {i for i, (_, _, k) in enumerate(groups) if k in whole}
+    return _rebuilt(points, parts, groups, into), tuple(shape for _, shape, _ in groups), merged
+
+
+def _contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequence[Shape]) -> dict[int, int]:
+    """Which groups lie inside the round body of another, and of which."""
+    into: dict[int, int] = {}
+    # Of two that lie inside each other the one whose surface holds more points is the body.
+    for a in sorted(range(len(members)), key=lambda k: -_held(shapes[k])):
+        if a in into or _held(shapes[a]) < SURFACE * len(members[a]):
+            continue
+        slack = SLACK * float(shapes[a].noise_distance)
+        inside = [len(own) > 0 and _inside(shapes[a].primitive, points[own], slack).mean() >= INSIDE for own in members]
+        for b in range(len(members)):
+            # A group that holds others is no part itself.
+            if inside[a] and inside[b] and b != a and b not in into and b not in into.values():
+                into[b] = a
+    return into
+
+
+def _inside(body: Primitive | None, points: np.ndarray, slack: float) -> np.ndarray:
+    """Which points lie inside a round body, or outside by no more than the slack."""
+    if isinstance(body, Sphere):
+        return np.asarray(np.linalg.norm(points - np.asarray(body.center), axis=1) <= float(body.radius) + slack)
+    if isinstance(body, Cylinder):
+        start, low, high, radius, slope = body.base, 0.0, float(body.height), float(body.radius), 0.0
+    elif isinstance(body, Cone):
+        (low, high), slope = np.asarray(body.height, float), float(np.tan(float(body.half_angle)))
+        start, radius = body.apex, 0.0
+    else:
+        return np.zeros(len(points), bool)
+    offset, axis = points - np.asarray(start), np.asarray(body.axis)
+    along = offset @ axis
+    across = np.linalg.norm(offset - along[:, None] * axis, axis=1)
+    within = (along >= low - slack) & (along <= high + slack)
+    return np.asarray(within & (across <= radius + slope * along + slack))
+
+
 def _held(shape: Shape) -> float:
     return float(np.asarray(shape.inliers).sum())
 
 
 def _joined(
+    points: np.ndarray,
     flat: np.ndarray,
     members: Sequence[np.ndarray],
     shapes: Sequence[Shape],
     fit: Fit,
     largest: int,
+    camera: np.ndarray | None,
 ) -> dict[tuple[int, int], tuple[np.ndarray, Shape]]:
     """Pairs of groups that one surface holds, and that surface; each group is in one pair at most."""
     able = [k for k, own in enumerate(members) if len(own) >= FEWEST]
@@ -87,7 +168,8 @@ def _joined(
         for b in able
         if a < b
     }
-    pairs = sorted((p for p in apart if apart[p] < NEAR), key=apart.__getitem__)[:MOST_PAIRS]
+    able_pairs = (p for p in apart if apart[p] < NEAR or (apart[p] < FAR and _way_hidden(points, members, p, camera)))
+    pairs = sorted(able_pairs, key=apart.__getitem__)[:MOST_PAIRS]
     both = [np.sort(np.concatenate([members[a], members[b]])) for a, b in pairs]
     good: list[tuple[float, tuple[int, int], tuple[np.ndarray, Shape]]] = []
     for (a, b), own, shape in zip(pairs, both, fit(both, largest) if both else (), strict=True):
@@ -106,6 +188,36 @@ def _joined(
         if not {i for p in chosen for i in p} & set(pair):
             chosen[pair] = found
     return chosen
+
+
+def _way_hidden(
+    points: np.ndarray, members: Sequence[np.ndarray], pair: tuple[int, int], camera: np.ndarray | None
+) -> bool:
+    """Whether other groups stand before most of the way from one group to another."""
+    if camera is None:
+        return False
+    one, other = (np.median(points[members[k]], axis=0) - camera for k in pair)
+    rest = [own for k, own in enumerate(members) if k not in pair]
+    if not rest:
+        return False
+    offset = points[np.concatenate(rest)] - camera
+    depth = np.linalg.norm(offset, axis=1)
+    share = ((np.arange(STOPS) + 1) / (STOPS + 1))[:, None]
+    way = (1 - share) * one + share * other
+    far = np.linalg.norm(way, axis=1)
+    # As near in the view as half a stop.
+    reach = np.linalg.norm(other / np.linalg.norm(other) - one / np.linalg.norm(one)) / (STOPS + 1) / 2
+    close = 2 - 2 * (way / far[:, None]) @ (offset / np.maximum(depth, 1e-12)[:, None]).T < reach**2
+    return bool((close & (depth < far[:, None])).any(axis=1).mean() > 0.5)
+
+
+def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Shape) -> Shape:
+    """The same shape with more points than it was fitted to: those count by their orthogonal distance."""
+    inliers = np.zeros(len(every), bool)
+    if shape.primitive is not None:
+        inliers = distances(shape.primitive, points[every]) <= float(shape.noise_distance)
+    inliers[np.isin(every, own)] = np.asarray(shape.inliers)
+    return dataclasses.replace(shape, inliers=jnp.asarray(inliers))
 
 
 def _divided(
@@ -137,7 +249,8 @@ def _divided(
             count = sum(_held(shape) for _, shape in both)
             named = [(shape, shape.primitive) for _, shape in both if shape.primitive is not None]
             least = max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k]))
-            if len(named) == 2 and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
+            inner = _contained(points, two, [shape for _, shape in both])
+            if len(named) == 2 and not inner and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
                 good[k] = both
             if len(named) < 2:
                 tried.pop(k)

@@ -230,17 +230,17 @@ def _model(
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, **seen(own), **picked)
-        places = np.asarray(points[own])
+        places, eye = np.asarray(points[own]), None if camera is None else np.asarray(camera)
         if segment_rule == "robust" and "ks" not in options:
 
             def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
                 return fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
 
             across = np.asarray(tangents(jnp.asarray(vertical)))
-            parts, shapes = by_shapes(places, across, parts, shapes, fit)
-        if camera is not None:
+            parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
+        if eye is not None:
             members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(parts.k)]
-            shapes = with_hidden_ends(places, members, shapes, np.asarray(camera), plane, thickness)
+            shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,

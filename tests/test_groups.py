@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.groups import by_shapes
-from jaxfuzzy.primitives import Sphere
+from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -17,12 +17,12 @@ def ball(center, radius=0.1, count=300, seed=0):
     return np.asarray(center) + radius * toward / np.linalg.norm(toward, axis=1, keepdims=True)
 
 
-def shape_of(points, sphere, noise=0.005):
-    """A shape as a fit would give it; unknown where the sphere holds less than half of the points."""
-    held = np.asarray(sphere.distance(points)) < noise
-    good = held.mean() > 0.5
+def shape_of(points, body, noise=0.005):
+    """A shape as a fit would give it; unknown where the body holds less than half of the points."""
+    held = np.asarray(body.distance(points)) < noise
+    good = held.mean() > 0.49
     return Shape(
-        primitive=sphere if good else None,
+        primitive=body if good else None,
         inliers=jnp.asarray(held & good),
         noise_distance=jnp.asarray(noise),
         scores={},
@@ -30,15 +30,15 @@ def shape_of(points, sphere, noise=0.005):
         counts={},
         covariance=jnp.zeros((4, 4)),
         status=jnp.asarray(int(Status(0)), jnp.int32),
-        kind="sphere" if good else "unknown",
+        kind=body.kind if good else "unknown",
     )
 
 
-def fitted_to(points, spheres):
-    """Takes for every set the sphere that holds most of it."""
+def fitted_to(points, bodies):
+    """Takes for every set the body that holds most of it."""
 
     def fit(sets, capacity):
-        best = lambda own: max((shape_of(points[own], s) for s in spheres), key=lambda s: int(s.inliers.sum()))
+        best = lambda own: max((shape_of(points[own], s) for s in bodies), key=lambda s: int(s.inliers.sum()))
         return tuple(best(own) for own in sets)
 
     return fit
@@ -92,3 +92,66 @@ def test_two_balls_that_touch_are_told_apart():
     held = fit([np.flatnonzero(np.asarray(alone.labels) == 0)], 0)
     same, _ = by_shapes(points[:300], ACROSS, alone, held, fit)
     assert same is alone
+
+
+def wall(radius, toward, count=500, seed=0):
+    """An arc of 100 degrees of an upright cylinder at (0, 0, 1), on the side that z leads to or comes from."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-0.87, 0.87, count)
+    return np.stack([radius * np.sin(angle), rng.uniform(0, 0.1, count), 1 + toward * radius * np.cos(angle)], axis=1)
+
+
+def vessel():
+    """The outer wall in front, the inner one behind, and their cylinders."""
+    points = np.concatenate([wall(0.1, -1), wall(0.085, 1, seed=1)])
+    upright = lambda radius: Cylinder(
+        jnp.array([0, 0, 1.0]), jnp.array([0, 1.0, 0]), jnp.asarray(radius), jnp.asarray(0.1)
+    )
+    return points, [upright(0.1), upright(0.085)]
+
+
+def test_what_lies_inside_a_round_body_is_part_of_it():
+    points, bodies = vessel()
+    stranger = ball([0.4, 0.05, 1.0], 0.05)
+    points = np.concatenate([points, stranger])
+    bodies.append(Sphere(jnp.array([0.4, 0.05, 1.0]), jnp.asarray(0.05)))
+    parts = divided(points, np.array([0, 1, 2]))
+    fit = fitted_to(points, bodies)
+    members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)]
+    merged, shapes = by_shapes(points, ACROSS, parts, fit(members, 0), fit)
+    assert merged.k == 2
+    labels = np.asarray(merged.labels)
+    assert len(set(labels[:1000]) - {-1}) == 1
+    np.testing.assert_array_equal(hardened(merged), labels)
+    whole = shapes[labels[labels >= 0][0]]
+    # The outside names the whole, of which its own surface holds about half.
+    np.testing.assert_allclose(whole.primitive.radius, 0.1)
+    assert 0.4 < np.mean(whole.inliers) < 0.6
+
+
+def test_a_vessel_in_one_group_is_not_divided():
+    points, bodies = vessel()
+    parts = segment(points, ks=(1,))
+    fit = fitted_to(points, bodies)
+    same, _ = by_shapes(points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)], 0), fit)
+    assert same is parts
+
+
+def test_halves_far_apart_are_merged_where_something_hides_what_is_between():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.08, 0.15, 600) * np.repeat([-1, 1], 300)
+    halves = np.stack([x, rng.uniform(-0.05, 0.05, 600), np.ones(600)], axis=1)
+    points = np.concatenate([halves, ball([0, 0, 0.6], 0.045)])
+    parts = divided(points, np.array([0, 1, 2]))
+    corners = jnp.array([[-0.15, -0.05, 1], [0.15, -0.05, 1], [0.15, 0.05, 1], [-0.15, 0.05, 1]])
+    bodies = [
+        Plane(corners.mean(0), jnp.array([0, 0, -1.0]), corners),
+        Sphere(jnp.array([0, 0, 0.6]), jnp.asarray(0.045)),
+    ]
+    fit = fitted_to(points, bodies)
+    shapes = fit([np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)], 0)
+    # Without a camera, or with one that sees between them, they are too far apart to be tried.
+    for camera in (None, np.array([0, 5.0, 1.0])):
+        assert by_shapes(points, ACROSS, parts, shapes, fit, camera)[0] is parts
+    merged, found = by_shapes(points, ACROSS, parts, shapes, fit, np.zeros(3))
+    assert merged.k == len(found) == 2

@@ -1,7 +1,8 @@
-"""Real clouds whose shapes are known: a stereo cloud of a mug, depth-camera clouds of cartons."""
+"""Real clouds whose shapes are known: a stereo cloud of a mug, depth-camera clouds of cartons and of tables with vessels."""
 
 import numpy as np
 import pytest
+from sklearn.metrics import adjusted_rand_score
 
 from jaxfuzzy.cloud import Cloud, read_cloud
 from jaxfuzzy.scene import model_cloud
@@ -30,3 +31,29 @@ def test_a_carton_is_one_box(shared_data, name):
     shape = fit_shape(points[:: len(points) // 2000][:2048])
     assert shape.kind == "box"
     assert np.asarray(shape.inliers).mean() > 0.9
+
+
+# What each labelled object is: cereal boxes; a flat tin, a box, a bowl and two mugs; a tin, a bowl and a box; a tin, a tube, a mug.
+TABLES = {
+    "learn0": ("box", "box"),
+    "learn33": ("cylinder", "cylinder", "sphere", "cylinder", "cylinder"),
+    "learn36": ("cylinder", "sphere", "cylinder"),
+    "learn44": ("cylinder", "cylinder", "cylinder"),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_of_mosd_has_its_objects(shared_data, name):
+    file = np.load(shared_data / "mosd" / f"{name}.npz")
+    xyz, truth = file["xyz"][::2, ::2].reshape(-1, 3), file["label"][::2, ::2].ravel() // 10
+    there = np.isfinite(xyz).all(1)
+    points, truth = xyz[there].astype(np.float32), truth[there]
+    scene = model_cloud(Cloud(points))
+    labels = np.asarray(scene.segmentation.labels)
+    assert scene.segmentation.k == len(TABLES[name])
+    own = truth >= 2
+    # The rest are points at the foot that went with the table.
+    assert adjusted_rand_score(truth[own], labels[own]) > 0.95
+    for i, shape in enumerate(scene.shapes):
+        which = np.bincount(truth[labels == i]).argmax()
+        assert shape.kind == TABLES[name][which - 2]
