@@ -58,6 +58,9 @@ def as_float(value: Any) -> Array:
     """
     if not isinstance(value, jax.Array):
         value = np.asarray(value)
-    if not jnp.issubdtype(value.dtype, jnp.floating) or jnp.finfo(value.dtype).bits < 32:
-        return jnp.asarray(value, jnp.result_type(float))
-    return jnp.asarray(value)
+    own = jnp.issubdtype(value.dtype, jnp.floating) and jnp.finfo(value.dtype).bits >= 32
+    dtype = jax.dtypes.canonicalize_dtype(value.dtype) if own else jnp.result_type(float)
+    if isinstance(value, jax.Array):
+        return value.astype(dtype)
+    # `jnp.asarray` would compile a program for every new number of points; JAX may keep what it is given here, hence the copy.
+    return jax.device_put(np.array(value, dtype))

@@ -2,6 +2,7 @@
 
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -136,15 +137,20 @@ def fit_ground(
     if best is None:
         none = jnp.zeros(len(x), bool)
         return Ground(
-            None, none, jnp.asarray(std) if known else None, zero + 1, zero, jnp.asarray(int(Status.NO_GROUND))
+            None,
+            none,
+            jax.device_put(np.array(std)) if known else None,
+            zero + 1,
+            zero,
+            jnp.asarray(int(Status.NO_GROUND)),
         )
     normal, offset, spread = np.asarray(best.normal), float(best.offset), scale * float(best.spread)
     residual = (x @ normal - offset) / deviation_across(normal, ray, floor)
     inliers = (np.abs(residual) <= POINT_DELTA * spread) & (w > 0)
     return Ground(
         _rectangle(x[inliers], normal, offset),
-        jnp.asarray(inliers),
-        jnp.asarray(std * spread),
+        jax.device_put(inliers),
+        jax.device_put(std * spread),
         zero + (spread if known else 1.0),
         best.support,
         jnp.asarray(int(Status.GROUND_SLAB) if known and spread > SLAB else 0),
@@ -207,7 +213,7 @@ def foreground(
         walls.append(_rectangle(x[on], normal, offset))
         standing &= residual >= -ABOVE
         kept = ahead
-    return Foreground(jnp.asarray(kept), tuple(walls), cut)
+    return Foreground(jax.device_put(kept), tuple(walls), cut)
 
 
 def upright(points: Float[ArrayLike, "N 3"], ground: Plane) -> tuple[Array, Array, Array]:

@@ -10,6 +10,7 @@ are two.
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -313,9 +314,9 @@ def _rebuilt(
         parts.partition,
         centers=jnp.asarray(np.stack(centers), parts.partition.centers.dtype),
         sizes=jnp.asarray(np.array(size) / np.sum(size), parts.sizes.dtype),
-        memberships=jnp.asarray(memberships),
-        noise=jnp.asarray(noise),
-        labels=jnp.asarray(labels),
+        memberships=jax.device_put(memberships),
+        noise=jax.device_put(noise),
+        labels=jax.device_put(labels),
     )
     return dataclasses.replace(
         parts,

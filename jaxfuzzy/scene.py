@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -186,7 +187,8 @@ def _model(
     weights: Any = None,
     **options: Any,
 ) -> Scene:
-    points = checks.places(cloud.points, "cloud.points")
+    # Picked from on the host: each number of points picked in JAX would compile and keep a program of its own.
+    points = np.asarray(checks.places(cloud.points, "cloud.points"))
     count = points.shape[0]
     vertical = CAMERA_UP if isinstance(up, str) else checks.direction(up, "up")
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
@@ -205,14 +207,14 @@ def _model(
             plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
             vertical = vertical if plane is None else np.asarray(plane.normal)
     if isinstance(noise_distance, str) and deviation is not None:
-        noise_distance = NOISE_SIGMAS * deviation
+        noise_distance = NOISE_SIGMAS * np.asarray(deviation)
     segment_rule, shape_rule = RULES[rule]
     own = np.flatnonzero(kept)
 
     def seen(of: np.ndarray) -> dict[str, Any]:
         """What both stages take beside the points."""
-        noise = noise_distance if np.ndim(noise_distance) == 0 else jnp.asarray(noise_distance)[of]
-        own_weights = None if heaviness is None else heaviness[of]
+        noise = noise_distance if np.ndim(noise_distance) == 0 else np.asarray(noise_distance)[of]
+        own_weights = None if heaviness is None else np.asarray(heaviness)[of]
         return {"up": vertical, "camera": camera, "noise_distance": noise, "weights": own_weights}
 
     with clock.stage("objects"):
@@ -223,14 +225,14 @@ def _model(
         picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
         parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
         if plane is not None:
-            raised = _standing(np.asarray(points[own]), np.asarray(parts.labels), plane)
+            raised = _standing(points[own], np.asarray(parts.labels), plane)
             if not raised.all():
                 own = own[raised]
                 parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, **seen(own), **picked)
-        places, eye = np.asarray(points[own]), None if camera is None else np.asarray(camera)
+        places, eye = points[own], None if camera is None else np.asarray(camera)
         if segment_rule == "robust" and "ks" not in options:
 
             def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
@@ -280,13 +282,15 @@ def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane) -> np.ndarr
 
 def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:
     """A division of some points as one of all: the others belong to noise alone."""
-    partition = parts.partition
-    labels = jnp.full(count, -1, parts.labels.dtype).at[own].set(parts.labels)
+
+    def filled(filler: float, values: Array) -> Array:
+        whole = np.full((count, *values.shape[1:]), filler, values.dtype)
+        whole[own] = np.asarray(values)
+        return jax.device_put(whole)
+
+    partition, labels = parts.partition, filled(-1, parts.labels)
     whole = dataclasses.replace(
-        partition,
-        memberships=jnp.zeros((count, parts.k), partition.memberships.dtype).at[own].set(partition.memberships),
-        noise=jnp.ones(count, partition.noise.dtype).at[own].set(partition.noise),
-        labels=labels,
+        partition, memberships=filled(0, partition.memberships), noise=filled(1, partition.noise), labels=labels
     )
     return dataclasses.replace(parts, labels=labels, partition=whole)
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from functools import partial
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -154,9 +155,9 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
     partition = Partition(
         centers=jnp.asarray(centers, x.dtype),
         sizes=jnp.asarray(sizes, x.dtype),
-        memberships=jnp.asarray(u[cell]),
-        noise=jnp.asarray(lost[cell]),
-        labels=jnp.asarray(labels[cell]),
+        memberships=jax.device_put(u[cell]),
+        noise=jax.device_put(lost[cell]),
+        labels=jax.device_put(labels[cell]),
         objective=groups.objective,
         steps=jnp.asarray(SWEEPS),
         status=jnp.asarray(int(status), jnp.int32),
