@@ -72,7 +72,8 @@ def sizes_of(kind: str, primitive: Any) -> dict[str, float]:
 
 def rendered(_: Path, seeds: int = 20) -> dict[str, Any]:
     """Random tables of four objects, one of each kind, camera tilted by 0 to 35 degrees."""
-    rows, errors, right_kinds, right_counts = [], {"radius": [], "half-angle": []}, [], []
+    rows, right_kinds, right_counts = [], [], []
+    errors: dict[str, list[float]] = {"radius": [], "half-angle": [], "in deviations": []}
     for seed in range(seeds):
         tilt = 35 * seed / (seeds - 1)
         picture = render_pair(table_scene(seed, tilt=np.deg2rad(tilt)), seed=seed)
@@ -87,7 +88,7 @@ def rendered(_: Path, seeds: int = 20) -> dict[str, Any]:
         "scenes": seeds,
         "count right": float(np.mean(right_counts)),
         "kinds right": float(np.mean(right_kinds)),
-        "median relative error": {name: float(np.median(e)) for name, e in errors.items() if e},
+        "median error": {name: float(np.median(e)) for name, e in errors.items() if e},
     }
     print(result)
     return result | {"rows": rows}
@@ -105,9 +106,13 @@ def compared(scene: jf.Scene, picture: Rendered, errors: dict[str, list[float]])
         right = len(mine) == 1 and scene.shapes[mine[0]].kind == kind
         found[f"{kind} as {'+'.join(scene.shapes[i].kind for i in mine) or 'nothing'}"] = right
         if right:
-            measured = sizes_of(kind, scene.shapes[mine[0]].primitive)
+            shape = scene.shapes[mine[0]]
+            measured, deviation = sizes_of(kind, shape.primitive), np.sqrt(np.diag(np.asarray(shape.covariance)))
             for name, value in sizes_of(kind, primitive).items():
                 errors[name].append(abs(measured[name] / value - 1))
+                place = shape.primitive.parameter_names.index(name.replace("-", "_"))
+                unit = 1e3 if name == "radius" else np.degrees(1)
+                errors["in deviations"].append(abs(measured[name] - value) / (unit * deviation[place]))
     return found
 
 

@@ -18,6 +18,7 @@ from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.matcher import Matcher
+from jaxfuzzy.objects import MOST
 from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
@@ -33,6 +34,9 @@ CAMERA_UP = (0.0, -1.0, 0.0)
 # How far in radians a supporting plane may lean from a vertical that was given.
 KNOWN_TILT = 0.15
 FEWEST_POINTS = 50
+# Neighboring pixels that together tell as much of a size as one independent point: 93 to 360, 217 on average, against the
+# ground truth of thirteen real pairs (`measure_noise`). Points without pixels count one each.
+PIXELS_PER_POINT = 217
 # A group that rises above the ground by no more than this share of the highest one's height is part of the ground.
 FLAT = 0.05
 SEGMENT_OPTIONS = ("ks",)
@@ -146,6 +150,7 @@ def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: An
             `ground`: "auto" to look for a supporting plane and to leave out what belongs to it; None where the cloud has none,
             which needs `up`. `camera`: where the points were seen from (3,), the origin by default; None where not known.
             `ks`: numbers of objects allowed, as in `segment`. `kinds`, `distance`, `noise_distance`, `weights`: as in `fit_shape`.
+            Covariances of clouds with `pixels_px` allow for neighboring pixels that err alike.
             `rule`: "robust" (the default, for objects; "likelihood" is the same), "gric", or "paper" for the paper's own rules
             throughout.
 
@@ -243,6 +248,8 @@ def _model(
         if eye is not None:
             members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(parts.k)]
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
+        if cloud.pixels_px is not None:
+            shapes = tuple(_with_correlated_errors(shape) for shape in shapes)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,
@@ -278,6 +285,15 @@ def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane) -> np.ndarr
     rises = [np.quantile(height[labels == k], 0.95) for k in range(labels.max() + 1)]
     flat = np.flatnonzero(np.array(rises) < FLAT * max(rises, default=0.0))
     return ~np.isin(labels, flat)
+
+
+def _with_correlated_errors(shape: Shape) -> Shape:
+    """The shape with the covariance of points of which many neighbors err alike."""
+    count = max(len(shape.inliers), 1)
+    worth = max(1.0, PIXELS_PER_POINT * min(count, MOST) / count)
+    return dataclasses.replace(
+        shape, covariance=jnp.asarray(np.asarray(shape.covariance) * worth, shape.covariance.dtype)
+    )
 
 
 def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:
