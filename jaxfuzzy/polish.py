@@ -17,7 +17,7 @@ from jaxfuzzy.candidates import Candidates
 from jaxfuzzy.choice import HALF_LOG_2PI
 from jaxfuzzy.rays import Meeting, Residual, View
 
-MOST_STEPS = 40
+MOST_STEPS = 120
 LEAN_PRIOR = 0.1745
 PLANE, BOX, REVOLUTION, SPHERE = range(4)
 
