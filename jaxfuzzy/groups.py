@@ -62,7 +62,7 @@ def by_shapes(
     """
     largest = int(np.bincount(np.asarray(parts.labels) + 1, minlength=2)[1:].max())
     parts, shapes, gathered = _gathered(points, parts, shapes, fit, largest)
-    members = _members(parts)
+    members = members_of(parts)
     flat = points @ across.T
     joined = _joined(points, flat, members, shapes, fit, largest, camera)
     taken = gathered.union(*joined)
@@ -80,7 +80,8 @@ def by_shapes(
     return _rebuilt(points, parts, groups, into), tuple(shape for _, shape, _ in groups)
 
 
-def _members(parts: Segmentation) -> list[np.ndarray]:
+def members_of(parts: Segmentation) -> list[np.ndarray]:
+    """Indices of the points of each group."""
     labels = np.asarray(parts.labels)
     return [np.flatnonzero(labels == k) for k in range(parts.k)]
 
@@ -89,7 +90,7 @@ def _gathered(
     points: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit, largest: int
 ) -> tuple[Segmentation, tuple[Shape, ...], set[int]]:
     """Merges groups into the round body that they lie inside: the new division, its shapes, and which of them are merged ones."""
-    members = _members(parts)
+    members = members_of(parts)
     into = _contained(points, members, shapes)
     if not into:
         return parts, shapes, set()

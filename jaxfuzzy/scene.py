@@ -15,7 +15,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.ground import fit_ground, foreground
-from jaxfuzzy.groups import by_shapes
+from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.objects import MOST
@@ -24,7 +24,7 @@ from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.segment import Segmentation, segment
-from jaxfuzzy.shapes import Shape, fit_members, fit_shapes
+from jaxfuzzy.shapes import Shape, fit_members, with_quadrics
 from jaxfuzzy.stereo import reconstruct
 
 # Noise distance in standard deviations of a point along its viewing ray: farther points rather belong to noise.
@@ -236,8 +236,9 @@ def _model(
                 parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
-        shapes = fit_shapes(points[own], parts.labels, rule=shape_rule, **seen(own), **picked)
         places, eye = points[own], None if camera is None else np.asarray(camera)
+        members = members_of(parts)
+        shapes = fit_members(places, members, rule=shape_rule, **seen(own), **picked)
         if segment_rule == "robust" and "ks" not in options:
 
             def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
@@ -245,8 +246,9 @@ def _model(
 
             across = np.asarray(tangents(jnp.asarray(vertical)))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
+            members = members_of(parts)
+        shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
-            members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(parts.k)]
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
         if cloud.pixels_px is not None:
             shapes = tuple(_with_correlated_errors(shape) for shape in shapes)

@@ -4,6 +4,7 @@ The engine is a fuzzy variety beside a noise cluster (see `search`), its residua
 known: stereo errs along the ray alone, so a surface should predict one depth a ray, its first hit that faces the camera.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from jaxfuzzy.looks import Look, Settings, look_at, unfit
 from jaxfuzzy.mostpoints import most_points
 from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
+from jaxfuzzy.quadrics import quadric_of
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
@@ -146,7 +148,7 @@ def fit_shapes(
     array = checks.places(points)
     label = checks.labels(labels, len(array))
     members = [np.flatnonzero(label == k) for k in range(int(label.max()) + 1)]
-    return fit_members(
+    shapes = fit_members(
         array,
         members,
         noise_distance=noise_distance,
@@ -157,6 +159,7 @@ def fit_shapes(
         rule=rule,
         weights=weights,
     )
+    return with_quadrics(np.asarray(array), members, shapes, weights)
 
 
 def fit_members(
@@ -226,6 +229,31 @@ def fit_members(
             arrays, told = _unknown(len(m), None, poor[i], settings)
             shapes.append(Shape(**jax.device_put(arrays), **told))
     return tuple(shapes)
+
+
+def with_quadrics(
+    points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequence[Shape], weights: ArrayLike | None = None
+) -> tuple[Shape, ...]:
+    """Names "quadric" what is refused as every kind but lies on a general quadric; its status stays REFUSED.
+
+    Args:
+        points: Points (N, 3) in metres.
+        members: Indices of the points of each shape.
+        shapes: The shapes.
+        weights: Weight of each point (N,).
+    """
+    weight = np.ones(len(points)) if weights is None else np.asarray(weights, float)
+    told = []
+    for own, shape in zip(members, shapes, strict=True):
+        refused = int(shape.status) & (Status.REFUSED | Status.ALL_NOISE) == Status.REFUSED
+        found = None
+        if shape.primitive is None and refused:
+            found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
+        if found is not None:
+            quadric = jax.tree.map(lambda a: jnp.asarray(a, points.dtype), found[0])
+            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jnp.asarray(found[1]))
+        told.append(shape)
+    return tuple(told)
 
 
 def _by_most_points(
@@ -367,7 +395,10 @@ def _told(fitted: Fitted, kinds: tuple[str, ...]) -> tuple[dict[str, float], flo
 def _unknown(size: int, look: Look | None, status: Status, settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     """The same of one that has none."""
     scores, margin, guards = ({}, 0.0, ()) if look is None else _told(look.fitted, settings.kinds)
-    used = 0.0 if look is None else DEVIATIONS * float(np.median(1 / look.item.gain)) * float(look.item.frame.unit)
+    used = 0.0
+    if look is not None:
+        deviation = float(np.median(1 / look.item.gain)) if look.item.given else look.expected
+        used = DEVIATIONS * deviation * float(look.item.frame.unit)
     arrays = {
         "primitive": None,
         "inliers": np.zeros(size, bool),
