@@ -69,6 +69,8 @@ def soak(scenes: int) -> dict[str, list[float]]:
         told["programs"].append(compiled)
         told["memory"].append(resident())
         told["points"].append(len(points))
+        if (seed + 1) % 50 == 0:
+            print(f"{seed + 1} scenes, {compiled} programs, {told['memory'][-1]:.0f} MiB", flush=True)
     return told
 
 
