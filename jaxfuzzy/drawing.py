@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Sphere
+from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric, Sphere
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -19,6 +19,8 @@ PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F
 NOISE_COLOR = "#606060"
 # Edges where the surface turns by more than this are drawn; those of a round side turn by 7.5 degrees.
 SHARP = math.radians(30.0)
+# Of a quadric's mesh along each coordinate: enough for a picture, a fifth of the triangles of its own default.
+CELLS = 24
 
 
 class Measure(NamedTuple):
@@ -143,7 +145,7 @@ def mesh(body: Primitive | None) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a primitive; empty for one that cannot be drawn."""
     if body is None or (getattr(body, "bounds", 0) is None):
         return np.zeros((0, 3)), np.zeros((0, 3), int)
-    vertices, faces = body.mesh()
+    vertices, faces = body.mesh(CELLS) if isinstance(body, Quadric) else body.mesh()
     return np.asarray(vertices, float), np.asarray(faces)
 
 

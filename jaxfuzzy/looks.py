@@ -162,7 +162,7 @@ def _reason(look: Look) -> Status:
     on = weight @ (distance <= DEVIATIONS)
     if look.noise > HOPELESS or on < max(FEWEST / 2, LEAST_SHARE * weight.sum()):
         return Status.ALL_NOISE | Status.REFUSED
-    times = p.scale / max(1.0, look.fitted.local)
+    times = float(p.scale) / max(1.0, float(look.fitted.local))
     if item.given and (times > MISFIT_GIVEN or _beyond(look) > BEYOND):
         return Status.REFUSED | look.scattered
     near = weight @ ((distance > DEVIATIONS) & (distance < FAR)) / (weight @ (distance < FAR))

@@ -83,7 +83,9 @@ def implicit(function: Callable[[np.ndarray], np.ndarray], bounds: np.ndarray, c
     value = np.where(value == 0, np.finfo(value.dtype).tiny, value)
     stride = np.array([(cells + 1) ** 2, cells + 1, 1])
     corner = np.stack(np.meshgrid(*[np.arange(cells)] * 3, indexing="ij"), -1).reshape(-1, 3) @ stride
-    nodes = (corner[:, None] + CUBE_CORNERS @ stride)[:, TETRAHEDRA].reshape(-1, 4)
+    cubes = corner[:, None] + CUBE_CORNERS @ stride
+    sign = value[cubes] < 0
+    nodes = cubes[sign.any(1) & ~sign.all(1)][:, TETRAHEDRA].reshape(-1, 4)
     inside = value[nodes] < 0
 
     edges: list[np.ndarray] = []  # three edges (pairs of nodes, inside first) a triangle

@@ -64,7 +64,7 @@ def to_dict(scene: "Scene") -> dict[str, Any]:
                 "parameters": None if body is None else {k: v for k, v in body.to_dict().items() if k != "kind"},
                 "sizes": [m._asdict() for m in drawing.measures(shape)],
                 "covariance": np.asarray(shape.covariance),
-                "covariance_of": [] if body is None else body.parameter_names,
+                "covariance_of": body.parameter_names if body is not None and np.size(shape.covariance) else [],
                 "points": int((labels == index).sum()),
                 "inliers": int(np.asarray(shape.inliers).sum()),
                 "noise_distance": float(shape.noise_distance),

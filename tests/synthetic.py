@@ -168,14 +168,15 @@ def make_scene(*, photograph=True, dtype=np.float64):
 
 
 def odd_scene():
-    """No photograph, no ground; an object of unknown kind, scores and a covariance that are not finite."""
+    """No photograph, no ground; an object of unknown kind, scores and a covariance that are not finite, one without any."""
     plain = make_scene(photograph=False)
     first = plain.shapes[0]
     unknown = dataclasses.replace(
         first, primitive=None, kind="unknown", covariance=jnp.zeros((0, 0)), scores={}, margin=math.inf
     )
+    bare = dataclasses.replace(plain.shapes[2], covariance=jnp.zeros((0, 0)))
     flat = dataclasses.replace(plain.shapes[3], covariance=jnp.full((4, 4), jnp.inf))
-    return dataclasses.replace(plain, ground=None, shapes=(unknown, *plain.shapes[1:3], flat, plain.shapes[4]))
+    return dataclasses.replace(plain, ground=None, shapes=(unknown, plain.shapes[1], bare, flat, plain.shapes[4]))
 
 
 def empty_scene():
