@@ -169,6 +169,7 @@ def lengths(truth, shape):
             yield float(got.size[i] / real.size[j]), bool(got.seen[i])
 
 
+@pytest.mark.slow
 def test_few_false_alarms():
     alone = [simulate_object(kind, 200 + i, outliers=(0.0, 0.1, 0.3, 0.5)[i % 4]) for kind in KINDS for i in range(8)]
     labels = np.repeat(np.arange(40), [len(cloud.points) for cloud in alone])
@@ -209,6 +210,7 @@ def test_a_box_seen_from_one_two_or_three_sides():
             np.testing.assert_allclose(ratio, 1, atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_whole_way_says_at_least():
     rng = np.random.default_rng(0)
     points = np.concatenate([(p := seen(CYLINDER, 3000))[p[:, 1] > 0], seen(SCREEN, 3000)])
