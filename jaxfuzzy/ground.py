@@ -31,6 +31,8 @@ ABOVE = 3.0
 # A wall has at most this share of the points behind it, at least that share before it, and spans at least that much of the view.
 BEHIND, AHEAD, SPAN = 0.1, 0.01, 0.4
 MOST_WALLS = 4
+# Through so few points there is always a plane.
+FEWEST = 10
 # A supporting plane must hold this share of the view, net of what is seen below it.
 LEAST_SUPPORT = 0.004
 # Standard deviations tried where none is given, as shares of the scene's spread.
@@ -134,7 +136,14 @@ def fit_ground(
     prior = prior_of(axis, (0.0, max_tilt / 2, max_tilt), eye, dtype)
     best, scale = _fit(view, prior, (1.0, 2.0) if known else UNKNOWN_NOISE)
     zero = jnp.zeros((), dtype)
-    if best is None:
+    normal, offset, spread, inliers = np.zeros(3, dtype), 0.0, 0.0, np.zeros(len(x), bool)
+    if best is not None:
+        # An exact plane has no spread; rounding is the least there is.
+        normal, offset = np.asarray(best.normal), float(best.offset)
+        spread = max(scale * float(best.spread), float(np.finfo(dtype).eps))
+        residual = (x @ normal - offset) / deviation_across(normal, ray, floor)
+        inliers = (np.abs(residual) <= POINT_DELTA * spread) & (w > 0)
+    if best is None or inliers.sum() < FEWEST:
         none = jnp.zeros(len(x), bool)
         return Ground(
             None,
@@ -144,9 +153,6 @@ def fit_ground(
             zero,
             jnp.asarray(int(Status.NO_GROUND)),
         )
-    normal, offset, spread = np.asarray(best.normal), float(best.offset), scale * float(best.spread)
-    residual = (x @ normal - offset) / deviation_across(normal, ray, floor)
-    inliers = (np.abs(residual) <= POINT_DELTA * spread) & (w > 0)
     return Ground(
         _rectangle(x[inliers], normal, offset),
         jax.device_put(inliers),

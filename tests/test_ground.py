@@ -8,6 +8,7 @@ from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.ground import find_ground, fit_ground, foreground, upright
 from jaxfuzzy.planes import GRID, _within
 from jaxfuzzy.rig import load_rig
+from jaxfuzzy.simulate import simulate_scene
 from jaxfuzzy.status import Status
 from jaxfuzzy.stereo import example_pair, reconstruct
 
@@ -313,3 +314,14 @@ def test_scenes_without_a_plane(shared_data, name):
     images = [cv2.imread(str(folder / f"view{i}.png")) for i in (1, 5)]
     cloud = reconstruct(*images, load_rig(folder / "calib.txt"))
     assert find_ground(cloud.points, depth_std=cloud.depth_std) is None
+
+
+def test_a_plane_through_three_points_is_no_ground_and_an_exact_one_has_a_noise():
+    cloud = simulate_scene(2, 0, points=(150, 500))
+    ground = fit_ground(np.asarray(cloud.points, np.float32))
+    assert ground.plane is None
+    assert int(ground.status) & Status.NO_GROUND
+    a, b = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(1, 2, 40))
+    exact = fit_ground(np.stack([a, np.full_like(a, 0.5), b], -1).reshape(-1, 3))
+    assert exact.plane is not None
+    assert (np.asarray(exact.depth_std) > 0).all()
