@@ -80,7 +80,7 @@ class Look(NamedTuple):
 
     @property
     def misfit(self) -> float:
-        """That over what is expected of a right one."""
+        """Noise of the surface over what is expected of a right one."""
         return self.noise / self.expected
 
     @property

@@ -199,8 +199,6 @@ def frame(points: Float[Array, "N D"], weights: Float[Array, " N"] | None) -> tu
         weights = weights.astype(points.dtype) / weights.max()
         origin = points[jnp.argmax(weights)]
     # Sums, not matrix products, which would need the offsets in memory and, with 4-byte floats, lose 0.3 % of 3 million points.
-    # Sums, not matrix products, which would need the offsets in memory and, with 4-byte floats, lose 0.3 % of 3 million points.
-    # Sums, not matrix products, which with 4-byte floats lose 0.3 % of 3 million points.
     total = weights.sum()
     here = (weights > 0)[:, None]
     mean = origin + jnp.where(here, weights[:, None] * (points - origin), 0).sum(axis=0) / total
