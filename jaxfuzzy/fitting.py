@@ -10,7 +10,7 @@ from jax import lax
 
 from jaxfuzzy import bounds, polish, rays, search
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.objects import MOST, Frame, Prepared, capacity_for
+from jaxfuzzy.objects import MOST, Frame, Prepared
 from jaxfuzzy.primitives import Primitive
 
 FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
@@ -175,11 +175,13 @@ def assemble_batch(
 
 
 def distances(primitive: Primitive, points: np.ndarray) -> np.ndarray:
-    """Distances in metres of points (N, 3) from a bounded primitive, by a program of one of a few sizes."""
-    if not len(points):
-        return np.zeros(0, points.dtype)
-    padded = np.pad(points, ((0, capacity_for(len(points)) - len(points)), (0, 0)), mode="edge")
-    return np.asarray(_distances(primitive, padded))[: len(points)]
+    """Distances in metres of points (N, 3) from a bounded primitive, by a program of one size."""
+    found = [np.zeros(0, points.dtype)]
+    for start in range(0, len(points), MOST):
+        own = points[start : start + MOST]
+        padded = np.pad(own, ((0, MOST - len(own)), (0, 0)), mode="edge")
+        found.append(np.asarray(_distances(primitive, padded))[: len(own)])
+    return np.concatenate(found)
 
 
 @jax.jit

@@ -5,15 +5,16 @@ nothing of kinds, say it is.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
-from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, prepared, stacked
+from jaxfuzzy.objects import CAPACITIES, DEVIATIONS, MOST, Prepared, batches, prepared, stacked
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
@@ -40,6 +41,8 @@ LEAST_SHARE = 0.1
 UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
+# Of a cloud of so many points the largest object is all but sure to have more than the smaller one of two compiled sizes.
+LARGE = 8 * MOST
 
 
 class Settings(NamedTuple):
@@ -129,6 +132,22 @@ def look_at(items: Sequence[Prepared], settings: Settings) -> list[Look]:
         if not new.reason and new.misfit <= SUSPECT and (looks[i].reason or new.score < looks[i].score):
             looks[i] = new
     return looks
+
+
+@contextmanager
+def compiling_ahead(count: int, dtype: Any, along_ray: bool) -> Iterator[None]:
+    """Compiles the search beside what the block does, where the number of points tells for which size of objects.
+
+    Args:
+        count: Points of the whole cloud.
+        dtype: Their type.
+        along_ray: Whether residuals will be along the viewing ray.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        if count <= CAPACITIES[0] or count > LARGE:
+            nothing = stacked((), CAPACITIES[0] if count <= CAPACITIES[0] else MOST, dtype)
+            pool.submit(fit_batch, nothing, np.ones(len(KINDS), bool), np.asarray(False), along_ray)
+        yield
 
 
 def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[float] = ()) -> list[Look]:

@@ -17,6 +17,7 @@ from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
+from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.objects import MOST
 from jaxfuzzy.occlusion import with_hidden_ends
@@ -201,39 +202,41 @@ def _model(
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
     thickness = 0.0
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
-    with clock.stage("ground"):
-        if ground is not None:
-            found = fit_ground(
-                points, up=vertical, weights=heaviness, depth_std=cloud.depth_std, camera=camera, **known_up
-            )
-            standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
-            kept &= np.asarray(standing.mask)
-            thickness = float(standing.cut)
-            plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
-            vertical = vertical if plane is None else np.asarray(plane.normal)
-    if isinstance(noise_distance, str) and deviation is not None:
-        noise_distance = NOISE_SIGMAS * np.asarray(deviation)
-    segment_rule, shape_rule = RULES[rule]
-    own = np.flatnonzero(kept)
+    along_ray = camera is not None and options.get("distance", "ray") == "ray"
+    with compiling_ahead(count, points.dtype, along_ray):
+        with clock.stage("ground"):
+            if ground is not None:
+                found = fit_ground(
+                    points, up=vertical, weights=heaviness, depth_std=cloud.depth_std, camera=camera, **known_up
+                )
+                standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
+                kept &= np.asarray(standing.mask)
+                thickness = float(standing.cut)
+                plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
+                vertical = vertical if plane is None else np.asarray(plane.normal)
+        if isinstance(noise_distance, str) and deviation is not None:
+            noise_distance = NOISE_SIGMAS * np.asarray(deviation)
+        segment_rule, shape_rule = RULES[rule]
+        own = np.flatnonzero(kept)
 
-    def seen(of: np.ndarray) -> dict[str, Any]:
-        """What both stages take beside the points."""
-        noise = noise_distance if np.ndim(noise_distance) == 0 else np.asarray(noise_distance)[of]
-        own_weights = None if heaviness is None else np.asarray(heaviness)[of]
-        return {"up": vertical, "camera": camera, "noise_distance": noise, "weights": own_weights}
+        def seen(of: np.ndarray) -> dict[str, Any]:
+            """What both stages take beside the points."""
+            noise = noise_distance if np.ndim(noise_distance) == 0 else np.asarray(noise_distance)[of]
+            own_weights = None if heaviness is None else np.asarray(heaviness)[of]
+            return {"up": vertical, "camera": camera, "noise_distance": noise, "weights": own_weights}
 
-    with clock.stage("objects"):
-        if len(own) < FEWEST_POINTS:
-            raise checks.DataError(
-                f"only {len(own)} of {count} points stand above the ground, {FEWEST_POINTS} are needed"
-            )
-        picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
-        parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
-        if plane is not None:
-            raised = _standing(points[own], np.asarray(parts.labels), plane)
-            if not raised.all():
-                own = own[raised]
-                parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
+        with clock.stage("objects"):
+            if len(own) < FEWEST_POINTS:
+                raise checks.DataError(
+                    f"only {len(own)} of {count} points stand above the ground, {FEWEST_POINTS} are needed"
+                )
+            picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
+            parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
+            if plane is not None:
+                raised = _standing(points[own], np.asarray(parts.labels), plane)
+                if not raised.all():
+                    own = own[raised]
+                    parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         places, eye = points[own], None if camera is None else np.asarray(camera)
