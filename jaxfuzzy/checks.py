@@ -80,8 +80,14 @@ def memberships(value: Any, count: int, name: str = "memberships") -> Array:
 
 
 def fuzzifier(value: Any, name: str = "m") -> Any:
-    """The fuzzifier: a finite number above 1."""
-    return number(value, name, above=1.0)
+    """The fuzzifier: a finite number above 1, in single precision too, which points may have."""
+    number(value, name, above=1.0)
+    if is_concrete(value):
+        with np.errstate(over="ignore"):
+            known = np.asarray(value).astype(np.float32)
+        if not 1 < known < np.inf:
+            raise ValueError(f"{name} must be a finite number above 1.0 in single precision, got {float(value)}")
+    return value
 
 
 def noise_distance(value: Any, count: int | None = None, name: str = "noise_distance") -> Any:

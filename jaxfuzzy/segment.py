@@ -227,7 +227,8 @@ def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     # `neighbour` points within a disc of this radius: so much surface has each of the points that lie on a surface.
     area = np.pi * usual**2 / max(neighbour, 1) * (reach <= ALONE * usual).mean() * len(crowd)
     spacing, surface = np.sqrt(area / max(len(real) * (reach <= ALONE * usual).mean(), 1)), np.sqrt(area)
-    smallest = np.sqrt(np.finfo(x.dtype).eps) * max(float(np.abs(crowd).max()), 1e-30)
+    # Points that are all one have no scale of their own: any will do.
+    smallest = np.sqrt(np.finfo(x.dtype).eps) * (float(np.abs(crowd).max()) or 1.0)
     return max(BANDWIDTH * float(np.cbrt(spacing**2 * surface)), smallest)
 
 

@@ -23,6 +23,8 @@ Index = Literal[
 INDICES = ("vrc", "xie_beni", "partition_coefficient", "modified_partition_coefficient", "fuzzy_silhouette", "jump")
 # Where VRC rises to its upper end only, the paper takes the k before which it "increases rapidly": made exact as this ratio.
 ABRUPT = 2.0
+# Candidates fitted in lock step on a CPU, where it saves little that they are: all of them wait for the slowest.
+LOCK_STEP = 2
 # Points whose distances to all others are held at once by the silhouette.
 SILHOUETTE_ROWS = 256
 
@@ -159,7 +161,12 @@ def _fit_all(
     def fit(seeds: Array, mask: Array) -> Partition:
         return _fit(points, seeds, m, noise_distance, weights, effort, mask=mask, **static)
 
-    partitions = jax.vmap(fit)(seeds, mask)
+    count = mask.shape[0]
+    width = min(count, LOCK_STEP) if jax.default_backend() == "cpu" else count
+    # Filled up with the first candidate again, the quickest to stop.
+    rows = np.r_[np.arange(count), np.zeros(-count % width, int)].reshape(-1, width)
+    found = jax.lax.map(lambda own: jax.vmap(fit)(*own), (seeds[rows], mask[rows]))
+    partitions = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
     ks = mask.sum(axis=1)
     if index == "jump":
         return partitions, _jumps(points, partitions, weights)

@@ -257,6 +257,22 @@ def test_shapes_at_length(x, delta, weighing):
     try_shapes(x, delta, weighing)
 
 
+@pytest.mark.parametrize("m", [1e300, 1 + 1e-9])
+def test_a_fuzzifier_that_single_precision_cannot_hold_is_refused(m):
+    x = np.random.default_rng(0).normal(size=(24, 3)).astype(np.float32)
+    for call in (lambda: jf.fcm(x, x[:2], m=m), lambda: jf.choose_k(x, m=m), lambda: jf.nfcv(x, np.ones((24, 1)), m=m)):
+        with pytest.raises(ValueError, match="m must be a finite number above 1"):
+            call()
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0])
+def test_points_that_are_all_one_are_one_object(value):
+    found = jf.segment(np.full((120, 3), value, np.float32))
+    assert int(found.k) == 1
+    np.testing.assert_allclose(found.partition.centers, [[value] * 3], rtol=1e-6)
+    assert (np.asarray(found.labels) == 0).all()
+
+
 @pytest.mark.parametrize("scale", [1e-37, 1e-12, 1e12, 1e30])
 def test_scenes_of_no_size_are_refused(scale):
     x = np.random.default_rng(0).normal(size=(60, 3)) * scale
