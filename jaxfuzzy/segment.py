@@ -109,7 +109,8 @@ def segment(
 
 
 def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[int, ...], noise: float) -> Segmentation:
-    bandwidth = max(_bandwidth(x, w), noise)
+    # A noise distance beyond the cloud's own extent says no more than that extent, and may overflow when squared.
+    bandwidth = max(_bandwidth(x, w), min(noise, float(np.linalg.norm(np.ptp(x, axis=0)))))
     # The plane in its own frame, so that shifts and turns of the cloud change nothing.
     flat = (x - np.average(x, axis=0, weights=w)) @ axes.T
     turn = np.linalg.eigh((flat * w[:, None]).T @ flat)[1]

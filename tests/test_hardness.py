@@ -273,6 +273,13 @@ def test_points_that_are_all_one_are_one_object(value):
     assert (np.asarray(found.labels) == 0).all()
 
 
+def test_a_noise_distance_beyond_all_points_is_that_of_their_extent():
+    x = np.random.default_rng(0).normal(size=(120, 3)).astype(np.float32)
+    found, wide = jf.segment(x, noise_distance=1e30), jf.segment(x, noise_distance=100.0)
+    holds(found)
+    np.testing.assert_array_equal(found.labels, wide.labels)
+
+
 @pytest.mark.parametrize("scale", [1e-37, 1e-12, 1e12, 1e30])
 def test_scenes_of_no_size_are_refused(scale):
     x = np.random.default_rng(0).normal(size=(60, 3)) * scale
