@@ -160,9 +160,10 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
         fitted = jax.device_get(fit_batch(padded, allowed, np.asarray(settings.gric), settings.along_ray))
         return [jax.tree.map(lambda a, i=i: a[i], fitted) for i in range(len(batch))]
 
-    # Batches of one compiled size, side by side on the processors there are.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = [f for batch in pool.map(fit, batches(items)) for f in batch]
+    # Batches of one compiled size, side by side on the processors there are; two each, since some take longer than others.
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        found = [f for batch in pool.map(fit, batches(items, 2 * workers)) for f in batch]
     looks = []
     for i, (item, fitted) in enumerate(zip(items, found, strict=True)):
         noise = max(1.0, float(fitted.local)) * fitted.deviation * np.median(1 / item.gain)

@@ -149,8 +149,8 @@ def capacity_for(count: int) -> int:
     return next((c for c in CAPACITIES if c >= count), 1 << (count - 1).bit_length())
 
 
-def batches(items: Sequence[Any]) -> list[Sequence[Any]]:
-    """Divided into as few batches as hold them, of about the same size."""
-    count = -(-len(items) // BATCH)
+def batches(items: Sequence[Any], workers: int = 1) -> list[Sequence[Any]]:
+    """Divided into as few batches as hold them and keep so many workers busy, of about the same size."""
+    count = max(-(-len(items) // BATCH), min(len(items), workers))
     ends = np.linspace(0, len(items), count + 1).round().astype(int)
     return [items[a:b] for a, b in itertools.pairwise(ends)]

@@ -68,8 +68,8 @@ def rotation(about_x: Array, about_z: Array) -> Array:
 
 def dense(view: View) -> Array:
     """Which points have company: local density above a fifth of the largest. Uniform outliers have little (N,)."""
-    point = view.point[0].T
-    square = ((point[:, None] - point) ** 2).sum(-1)
+    # Added up axis by axis: a sum over a last axis of three takes twelve times as long.
+    square = sum((c[:, None] - c) ** 2 for c in view.point[0])
     company = (jnp.exp(-square / (2 * COMPANY**2)) * view.mask).sum(-1) * view.mask
     return (company > 0.2 * company.max()) & (view.mask > 0)
 
