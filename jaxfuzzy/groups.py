@@ -9,6 +9,7 @@ are two.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,8 @@ INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
 # Only neighbours are tried together: centers nearer than this share of the sum of their reaches, or than the second one where
 # something hides most of so many places on the way between them; and so many pairs at most.
 NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 5, 16
+# Points looked at for that, of all groups together.
+LOOKED_AT = 50_000
 # Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
 HOLDS, HOLDS_OF_ALL = 0.9, 0.7
 # A group of which one surface holds this share is one object. Two surfaces must hold this share of the others, and this much
@@ -170,7 +173,8 @@ def _joined(
         for b in able
         if a < b
     }
-    able_pairs = (p for p in apart if apart[p] < NEAR or (apart[p] < FAR and _way_hidden(points, members, p, camera)))
+    view = None if camera is None or len(members) < 3 else _seen_from(camera, points, members)
+    able_pairs = (p for p in apart if apart[p] < NEAR or (apart[p] < FAR and view is not None and _way_hidden(view, p)))
     pairs = sorted(able_pairs, key=apart.__getitem__)[:MOST_PAIRS]
     both = [np.sort(np.concatenate([members[a], members[b]])) for a, b in pairs]
     good: list[tuple[float, tuple[int, int], tuple[np.ndarray, Shape]]] = []
@@ -192,25 +196,47 @@ def _joined(
     return chosen
 
 
-def _way_hidden(
-    points: np.ndarray, members: Sequence[np.ndarray], pair: tuple[int, int], camera: np.ndarray | None
-) -> bool:
+class View(NamedTuple):
+    """Groups as the camera sees them.
+
+    Attributes:
+        middle: Of each group, from the camera (K, 3).
+        ray: Directions of a fair share of all points (n, 3).
+        depth: Their distances (n,).
+        group: Their groups (n,).
+    """
+
+    middle: np.ndarray
+    ray: np.ndarray
+    depth: np.ndarray
+    group: np.ndarray
+
+
+def _seen_from(camera: np.ndarray, points: np.ndarray, members: Sequence[np.ndarray]) -> View:
+    step = max(1, sum(map(len, members)) // LOOKED_AT)
+    some = [own[::step] for own in members]
+    offset = [points[own] - camera for own in some]
+    every = np.concatenate(offset)
+    depth = np.linalg.norm(every, axis=1)
+    return View(
+        np.stack([np.median(o, axis=0) if len(o) else np.zeros(3) for o in offset]),
+        every / np.maximum(depth, 1e-12)[:, None],
+        depth,
+        np.repeat(np.arange(len(some)), [len(own) for own in some]),
+    )
+
+
+def _way_hidden(view: View, pair: tuple[int, int]) -> bool:
     """Whether other groups stand before most of the way from one group to another."""
-    if camera is None:
-        return False
-    one, other = (np.median(points[members[k]], axis=0) - camera for k in pair)
-    rest = [own for k, own in enumerate(members) if k not in pair]
-    if not rest:
-        return False
-    offset = points[np.concatenate(rest)] - camera
-    depth = np.linalg.norm(offset, axis=1)
+    one, other = view.middle[list(pair)]
     share = ((np.arange(STOPS) + 1) / (STOPS + 1))[:, None]
     way = (1 - share) * one + share * other
     far = np.linalg.norm(way, axis=1)
     # As near in the view as half a stop.
     reach = np.linalg.norm(other / np.linalg.norm(other) - one / np.linalg.norm(one)) / (STOPS + 1) / 2
-    close = 2 - 2 * (way / far[:, None]) @ (offset / np.maximum(depth, 1e-12)[:, None]).T < reach**2
-    return bool((close & (depth < far[:, None])).any(axis=1).mean() > 0.5)
+    near = 2 - 2 * view.ray @ (way / far[:, None]).T < reach**2
+    others = (view.group != pair[0]) & (view.group != pair[1])
+    return bool((near & (view.depth[:, None] < far) & others[:, None]).any(axis=0).mean() > 0.5)
 
 
 def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Shape) -> Shape:

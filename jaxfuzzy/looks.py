@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
-from jaxfuzzy.objects import CAPACITIES, DEVIATIONS, MOST, Prepared, batches, prepared, stacked
+from jaxfuzzy.objects import CAPACITIES, DEVIATIONS, MOST, Prepared, batches, prepared, stacked, with_more
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
@@ -124,13 +124,13 @@ def look_at(items: Sequence[Prepared], settings: Settings) -> list[Look]:
                 better.append(i)
         unsure = better
     # What a box or a cone fits badly may be lying.
-    doubtful = [i for i, o in enumerate(looks) if o.reason or o.misfit > SUSPECT]
-    turned = [(i, item) for i in doubtful for item in _turned(looks[i], settings.camera, settings.along_ray)]
-    others = _search([item for _, item in turned], settings, [looks[i].expected for i, _ in turned])
-    for (i, _), new in zip(turned, others, strict=True):
+    doubtful = [(i, o) for i, o in enumerate(looks) if o.reason or o.misfit > SUSPECT]
+    turned = [(i, look, item) for i, look in doubtful for item in _turned(look, settings)]
+    others = _search([item for *_, item in turned], settings, [look.expected for _, look, _ in turned])
+    for (i, look, _), new in zip(turned, others, strict=True):
         # Another vertical is one more freedom: what it finds must fit well.
         if not new.reason and new.misfit <= SUSPECT and (looks[i].reason or new.score < looks[i].score):
-            looks[i] = new
+            looks[i] = new._replace(item=_whole(new.item, look, settings))
     return looks
 
 
@@ -205,15 +205,28 @@ def _with_noise_found(look: Look) -> Prepared:
     return item._replace(gain=item.gain / (found.deviation * found.polished.scale), given=True)
 
 
-def _turned(look: Look, camera: np.ndarray | None, along_ray: bool) -> list[Prepared]:
-    """The object with other verticals: square to most normals, as the axis of a lying cylinder is, and along most."""
-    item, normals = look.item, look.fitted.normals
+def _turned(look: Look, settings: Settings) -> list[Prepared]:
+    """The points searched with other verticals: square to most normals, as the axis of a lying cylinder is, and along most."""
+    item, normals, n = look.item, look.fitted.normals, look.fitted_to
     axes = np.linalg.eigh(normals.T @ normals)[1].T[[0, 2]] @ item.frame.turn
-    p = item.frame.origin + item.frame.unit * item.points @ item.frame.turn
-    looks = []
+    p, deviation = _in_metres(look, slice(n))
+    found = []
     for axis in axes:
         if abs(axis @ item.frame.turn[1]) < 0.95:
-            deviation = item.frame.unit / item.gain * look.fitted.deviation
-            new = prepared(p, item.weight, deviation, axis, camera, along_ray)
-            looks.append(new._replace(order=item.order[new.order], given=True))
-    return looks
+            new = prepared(p, item.weight[:n], deviation, axis, settings.camera, settings.along_ray)
+            found.append(new._replace(order=item.order[:n][new.order], given=True))
+    return found
+
+
+def _whole(new: Prepared, look: Look, settings: Settings) -> Prepared:
+    """An object turned, with all the points that were not searched."""
+    item, more = look.item, slice(look.fitted_to, None)
+    p, deviation = _in_metres(look, more)
+    return with_more(new, p, item.weight[more], deviation, item.order[more], settings.along_ray)
+
+
+def _in_metres(look: Look, of: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the user's frame and their deviations."""
+    frame = look.item.frame
+    p = frame.origin + frame.unit * look.item.points[of] @ frame.turn
+    return p, frame.unit / look.item.gain[of] * look.fitted.deviation

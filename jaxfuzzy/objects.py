@@ -19,6 +19,8 @@ CAPACITIES = (2048, 8192)
 MOST = CAPACITIES[-1]
 BATCH = 16
 GOLDEN = 0.6180339887498949
+# Height, and a trace of place for points of one height.
+TO_HEIGHT = np.array([1e-7, 1.0, 1.7e-7])
 
 
 class Frame(NamedTuple):
@@ -84,10 +86,8 @@ def prepared(
     scatter = (offset * share[:, None]).T @ offset
     unit = float(np.sqrt(np.trace(scatter)))
     q = offset / (unit if unit > 0 else 1.0)
-    # Sorted by height and then dealt out by the golden ratio, whatever order the points came in; weight 0 last.
-    order = np.lexsort((q[:, 2], q[:, 0], q[:, 1]))
-    order = order[np.argsort(np.arange(len(p)) * GOLDEN % 1.0, kind="stable")]
-    if not share.all():
+    order = fair_order(q)
+    if not share.all():  # weight 0 last
         order = order[np.argsort(share[order] == 0, kind="stable")]
     eye, depth, ray, relative = np.zeros(3), q[:, 2], np.zeros_like(q), np.ones(len(p))
     if along_ray and camera is not None:
@@ -110,6 +110,44 @@ def prepared(
         given=deviation is not None,
         frame=Frame(turn, middle, np.asarray(unit)),
         flatness=(float(principal[1] / max(principal[2], 1e-300)), float(principal[0] / max(principal[2], 1e-300))),
+    )
+
+
+def fair_order(points: np.ndarray) -> np.ndarray:
+    """An order of points (N, 3) that depends on their places alone and of which every beginning is a fair sample.
+
+    Sorted by height, those of one height by place, and then dealt out by the golden ratio.
+    """
+    order = np.argsort(points @ TO_HEIGHT)
+    return order[np.argsort(np.arange(len(points)) * GOLDEN % 1.0, kind="stable")]
+
+
+def with_more(
+    item: Prepared, p: np.ndarray, weight: np.ndarray, deviation: np.ndarray, order: np.ndarray, along_ray: bool
+) -> Prepared:
+    """An object with further points behind those that it was searched with, in the frame that it has.
+
+    Args:
+        item: The object.
+        p: Further points (N, 3) in metres.
+        weight: Their weights.
+        deviation: Their deviations in metres.
+        order: Which of the object's points each is.
+        along_ray: As it was prepared.
+    """
+    turn, origin, unit = item.frame
+    q = (p - origin) @ turn.T / unit
+    ray = np.zeros_like(q)
+    if along_ray:
+        ray = q - item.eye
+        ray = ray / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)[:, None]
+    join = lambda a, b: np.concatenate([a, b])
+    return item._replace(
+        points=join(item.points, q),
+        rays=join(item.rays, ray),
+        order=join(item.order, order),
+        gain=join(item.gain, unit / deviation),
+        weight=join(item.weight, weight),
     )
 
 

@@ -23,6 +23,8 @@ MOST_ASKED, FEWEST_ASKED = 128, 8
 # A view is blocked where so many points are nearer, within the reach of so many points of the sparser of the two: what is looked
 # at and what stands before it. Outliers are so sparse only where they are as many as the points of the shape.
 IN_FRONT, NEIGHBOURS = 4, 8
+# Of the points of a shape, and of those of none, so many are looked at.
+LOOKED_AT = 16_384
 # Nearer means by more than so many noise distances.
 CLEARLY = 2.0
 # An end is hidden when more than this share of the views beyond it is blocked.
@@ -64,16 +66,14 @@ def with_hidden_ends(
         ground: The plane they stand on.
         thickness: How far above it points were taken for its own.
     """
-    offset = np.asarray(points - camera, float)
-    depth = np.linalg.norm(offset, axis=1)
-    ray = offset / np.maximum(depth, 1e-12)[:, None]
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
-    sights = [_sight(ray[own], depth[own]) for own in on]
+    sights = [_sight(*_seen_from(camera, points, own)) for own in on]
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
+    outliers = _seen_from(camera, points, rest)
     told = []
     for k, shape in enumerate(shapes):
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
-        loose = Sight(ray[rest], depth[rest], sights[k].reach)
+        loose = Sight(*outliers, sights[k].reach)
         before = [*(s for i, s in enumerate(sights) if i != k), loose]
         hidden = {
             end.extent
@@ -124,6 +124,13 @@ def _rests(end: End, ground: Plane | None, thickness: float) -> bool:
     up = np.asarray(ground.normal)
     height = float((end.place - np.asarray(ground.point)) @ up)
     return bool(end.outward @ up < 0 and height < 2 * thickness + STRIP * end.length)
+
+
+def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions and distances of a fair share of some points."""
+    offset = np.asarray(points[own[:: -(-len(own) // LOOKED_AT) or 1]] - camera, float)
+    depth = np.linalg.norm(offset, axis=1)
+    return offset / np.maximum(depth, 1e-12)[:, None], depth
 
 
 def _sight(ray: np.ndarray, depth: np.ndarray) -> Sight:

@@ -8,6 +8,7 @@ generalised eigenproblems A n = lambda B n of nine unknowns do; in plain NumPy, 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.objects import MOST, fair_order
 from jaxfuzzy.primitives import Quadric
 
 # Noise distances annealed through, in units of the last, so many steps at each.
@@ -33,19 +34,11 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
     if unit == 0:
         return None
     p = (points - middle) / unit
-    x, y, z = p.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    embedded = np.stack([x * x, y * y, z * z, x * y, y * z, z * x, x, y, z], axis=1)
-    slopes = np.concatenate(
-        [
-            np.stack([2 * x, zero, zero, y, zero, z, one, zero, zero], axis=1),
-            np.stack([zero, 2 * y, zero, x, z, zero, zero, one, zero], axis=1),
-            np.stack([zero, zero, 2 * z, zero, y, x, zero, zero, one], axis=1),
-        ]
-    )
-    delta, square = noise_distance / unit, np.zeros(len(p))
+    some = np.flatnonzero(real)[fair_order(p[real])[:MOST]]
+    embedded, slopes = _terms(p[some])
+    delta, square = noise_distance / unit, np.zeros(len(some))
     for step in np.repeat(LADDER, STEPS):
-        pull = weights / (1 + square / (step * delta) ** 2) ** 2
+        pull = weights[some] / (1 + square / (step * delta) ** 2) ** 2
         pull = pull / pull.sum()
         mean = pull @ embedded
         offset = embedded - mean
@@ -54,8 +47,9 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
         root = np.linalg.cholesky(slope + 1e-12 * np.trace(slope) * np.eye(9))
         half = np.linalg.solve(root, np.linalg.solve(root, scatter).T)
         normal = np.linalg.solve(root.T, np.linalg.eigh((half + half.T) / 2)[1][:, 0])
-        value = offset @ normal
-        square = value**2 / np.maximum(((slopes @ normal) ** 2).reshape(3, -1).sum(axis=0), 1e-24)
+        square = _squared_distances(embedded, slopes, normal, mean)
+    if len(some) < len(p):
+        square = _squared_distances(*_terms(p), normal, mean)
     distance = np.sqrt(square) / delta
     on, near = weights @ (distance <= 1), weights @ ((distance > 1) & (distance <= NEAR))
     if not np.isfinite(distance).all() or on < LEAST * weights.sum() or near > BEYOND * (near + on):
@@ -64,6 +58,24 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
     bounds = np.stack([points[inliers].min(axis=0), points[inliers].max(axis=0)])
     coefficients = _placed(np.append(normal, -mean @ normal), middle, unit)
     return Quadric(jnp.asarray(coefficients), jnp.asarray(bounds)), inliers
+
+
+def _terms(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) in nine dimensions (N, 9), and the derivatives by x, y and z one after the other (3 N, 9)."""
+    x, y, z = p.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    slopes = [
+        np.stack([2 * x, zero, zero, y, zero, z, one, zero, zero], axis=1),
+        np.stack([zero, 2 * y, zero, x, z, zero, zero, one, zero], axis=1),
+        np.stack([zero, zero, 2 * z, zero, y, x, zero, zero, one], axis=1),
+    ]
+    return np.stack([x * x, y * y, z * z, x * y, y * z, z * x, x, y, z], axis=1), np.concatenate(slopes)
+
+
+def _squared_distances(embedded: np.ndarray, slopes: np.ndarray, normal: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Squared distances (N,) to the first order."""
+    steep = ((slopes @ normal) ** 2).reshape(3, -1).sum(axis=0)
+    return np.asarray(((embedded - mean) @ normal) ** 2 / np.maximum(steep, 1e-24))
 
 
 def _placed(coefficients: np.ndarray, middle: np.ndarray, unit: float) -> np.ndarray:

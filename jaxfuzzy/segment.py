@@ -241,7 +241,7 @@ def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarr
     while True:
         corner = np.floor(np.clip(flat / pitch, -1e9, 1e9)).astype(np.int64)
         key = (corner[:, 0] - corner[:, 0].min()) * (np.ptp(corner[:, 1]) + 1) + corner[:, 1] - corner[:, 1].min()
-        cell = np.unique(key, return_inverse=True)[1].astype(np.int64)
+        cell = _numbered(key)
         if cell.max() < most:
             break
         pitch *= 1.25
@@ -256,6 +256,15 @@ def _places(flat: np.ndarray, w: np.ndarray, bandwidth: float) -> tuple[np.ndarr
     capacity = next(c for c in CAPACITIES if c >= number)
     spare = capacity - number
     return np.pad(at, ((0, spare), (0, 0))), np.pad(weight * scale, (0, spare)), cell
+
+
+def _numbered(keys: np.ndarray) -> np.ndarray:
+    """Keys, whole numbers from 0 on, as their places among those that occur."""
+    if keys.max() > 8 * len(keys):
+        return np.unique(keys, return_inverse=True)[1].astype(np.int64)
+    occurs = np.zeros(int(keys.max()) + 1, bool)
+    occurs[keys] = True
+    return (np.cumsum(occurs) - 1)[keys]
 
 
 def _shares(labels: np.ndarray, w: np.ndarray, k: int, dtype: Any) -> Array:
