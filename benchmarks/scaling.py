@@ -84,6 +84,28 @@ def a_sweep(n: int, k: int, m: float) -> float:
     return sweeps((n,), k, m, 3 if n > 1e6 else 7)[n]
 
 
+def draw(by_count: dict[int, dict[float, float]], by_clusters: dict[int, dict[float, float]]) -> None:
+    """The plot: milliseconds a sweep against points and against clusters."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    for axes, rows, label in ((left, by_count, "points N, K = 8"), (right, by_clusters, "clusters K, N = 200,000")):
+        xs = np.array(list(rows), float)
+        for m, style in ((2.0, "o-"), (1.7, "s-")):
+            axes.loglog(xs, [1e3 * r[m] for r in rows.values()], style, label=f"m = {m:g}")
+        last = 1e3 * rows[max(rows)][2.0]
+        axes.loglog(xs, last * xs / xs[-1], "k:", label="linear")
+        axes.set(xlabel=label, ylabel="ms a sweep")
+        axes.legend()
+    right.set_xticks(list(by_clusters), list(map(str, by_clusters)))
+    right.minorticks_off()
+    RESULTS.mkdir(exist_ok=True)
+    figure.savefig(RESULTS / "scaling.png", dpi=110)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--most", type=float, default=1e7, help="largest number of points")
@@ -110,22 +132,7 @@ def main() -> None:
         ("K", "m = 2", "m = 1.7"),
         [(k, 1e9 * r[2.0] / k / 2e5, 1e9 * r[1.7] / k / 2e5) for k, r in by_clusters.items()],
     )
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-    for axes, rows, label in ((left, by_count, "points N, K = 8"), (right, by_clusters, "clusters K, N = 200,000")):
-        xs = np.array(list(rows), float)
-        for m, style in ((2.0, "o-"), (1.7, "s-")):
-            axes.loglog(xs, [1e3 * r[m] for r in rows.values()], style, label=f"m = {m:g}")
-        last = 1e3 * rows[max(rows)][2.0]
-        axes.loglog(xs, last * xs / xs[-1], "k:", label="linear")
-        axes.set(xlabel=label, ylabel="ms a sweep")
-        axes.legend()
-    RESULTS.mkdir(exist_ok=True)
-    figure.savefig(RESULTS / "scaling.png", dpi=110)
+    draw(by_count, by_clusters)
     write("scaling", {"by_count": by_count, "by_clusters": by_clusters, "memory": memory})
 
 
