@@ -92,12 +92,13 @@ def batches() -> None:
         labels = np.concatenate([np.full(len(one.points), i) for i, one in enumerate(made)])
         rows.append(("fit_shapes", count, seconds(partial(jf.fit_shapes, points, labels, camera=made[0].camera))))
     clouds = np.random.default_rng(0).normal(size=(1000, 300, 3)).astype(np.float32)
-    fit = jax.jit(jax.vmap(lambda x: jf.fcm(x, x[:3], memberships=False).centers))
-    for count in (1, 100, 1000):
-        some = jax.device_put(clouds[:count])
-        rows.append(
-            ("fcm under vmap, 300 points, K = 3", count, seconds(lambda some=some: fit(some).block_until_ready()))
-        )
+    one = lambda x: jf.fcm(x, x[:3], memberships=False).centers
+    for name, every in (("vmap", jax.vmap(one)), ("lax.map", lambda xs: jax.lax.map(one, xs))):
+        fit = jax.jit(every)
+        for count in (1, 100, 1000):
+            some = jax.device_put(clouds[:count])
+            call = lambda fit=fit, some=some: fit(some).block_until_ready()
+            rows.append((f"fcm under {name}, 300 points, K = 3", count, seconds(call)))
     table(
         "Many in one call",
         ("call", "objects", "seconds", "objects a second"),
