@@ -143,11 +143,21 @@ def compiling_ahead(count: int, dtype: Any, along_ray: bool) -> Iterator[None]:
         dtype: Their type.
         along_ray: Whether residuals will be along the viewing ray.
     """
-    with ThreadPoolExecutor(1) as pool:
+    with _threads(1) as pool:
         if count <= CAPACITIES[0] or count > LARGE:
             nothing = stacked((), CAPACITIES[0] if count <= CAPACITIES[0] else MOST, dtype)
             pool.submit(fit_batch, nothing, np.ones(len(KINDS), bool), np.asarray(False), along_ray)
         yield
+
+
+def _threads(count: int) -> ThreadPoolExecutor:
+    """Threads that compute in the precision this one does: `with jax.enable_x64()` holds for the thread that says so alone."""
+    double = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+
+    def enter() -> None:
+        jax.enable_x64(double).__enter__()  # for as long as the thread lives
+
+    return ThreadPoolExecutor(count, initializer=enter)
 
 
 def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[float] = ()) -> list[Look]:
@@ -162,7 +172,7 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
 
     # Batches of one compiled size, side by side on the processors there are; two each, since some take longer than others.
     workers = os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:
+    with _threads(workers) as pool:
         found = [f for batch in pool.map(fit, batches(items, 2 * workers)) for f in batch]
     looks = []
     for i, (item, fitted) in enumerate(zip(items, found, strict=True)):

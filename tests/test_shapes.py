@@ -3,9 +3,12 @@
 The search compiles once for double precision with a camera and once for single precision without; every test uses one of the two.
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfuzzy import looks
 from jaxfuzzy.shapes import fit_members, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
 from jaxfuzzy.status import Status
@@ -285,3 +288,9 @@ def test_error_bars_are_calibrated(kind):
     assert len(scores) > 190
     # Asked: 0.8 to 1.2. Errors sideways, a fifth of those in depth, are supposed and not simulated: too careful by a tenth.
     assert 0.7 < np.std(scores) < 1.2
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_threads_compute_in_the_precision_of_the_one_that_asks(double):
+    with jax.enable_x64(double), looks._threads(1) as pool:
+        assert pool.submit(lambda: jnp.ones(1).dtype).result() == jnp.ones(1).dtype
