@@ -408,7 +408,8 @@ def _rule_distance(rule: NoiseRule, tiles: Tiles, weights: Array | None, centers
             return total + jnp.where(real[:, None], squared_distances(block, centers), 0).sum(axis=0) @ w
 
         total = sum_tiles(tiles, add, jnp.zeros((), centers.dtype))
-        return tiles.scale * jnp.sqrt(rule.value * total / (tiles.weights.sum() * real.sum()))
+        mass = tiles.count if weights is None else weights.sum()
+        return tiles.scale * jnp.sqrt(rule.value * total / (mass * real.sum()))
 
     def one(block: Array) -> Array:
         return jnp.where(real[:, None], squared_distances(block, centers), jnp.inf).min(axis=0)

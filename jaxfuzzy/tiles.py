@@ -92,7 +92,7 @@ class Tiles:
 
     Attributes:
         blocks: Tiles of points, one a column: coordinates, squared length, 1. Padding points lie at 0.
-        weights: Weight of each point; padding has 0.
+        weights: Weight of each point; padding has 0. None where all points weigh the same, on one device.
         mean: What was taken off, in the input's units.
         scale: What was divided by; 1 where all points are equal.
         spread: RMS distance from the mean in the input's units, 0 where all points are equal.
@@ -102,7 +102,7 @@ class Tiles:
     """
 
     blocks: Float[Array, "T D_2 n"]
-    weights: Float[Array, "T n"]
+    weights: Float[Array, "T n"] | None
     mean: Float[Array, " D"]
     scale: Float[Array, ""]
     spread: Float[Array, ""]
@@ -131,12 +131,16 @@ def tile_points(
     # The map that is iterated commutes with shifts and scaling, so the frame itself needs no derivative.
     mean, spread = lax.stop_gradient(frame(points, weights) if whole is None else whole)
     scale = jnp.where(spread > 0, spread, 1)
-    weights = jnp.ones(count, points.dtype) if weights is None else weights.astype(points.dtype)
-    present = (weights > 0).sum()
     own = count if parts is None else -(-count // parts.count)
     # A power of two: matrix products with other numbers of rows took three to five times as long on a CPU.
     rows = min(max(256, 1 << ((TILE_VALUES // clusters).bit_length() - 1)), own)
-    lay = partial(_lay_out, mean, scale, -(-rows // 8) * 8, parts)
+    rows = -(-rows // 8) * 8
+    if weights is None and parts is None:
+        blocks = _design(rows, points, None, mean, scale)
+        return Tiles(blocks, None, mean, scale, spread, jnp.asarray(count), count)
+    weights = jnp.ones(count, points.dtype) if weights is None else weights.astype(points.dtype)
+    present = (weights > 0).sum()
+    lay = partial(_lay_out, mean, scale, rows, parts)
     if parts is None:
         blocks, weights = lay(points, weights)
     else:
@@ -150,7 +154,7 @@ def _lay_out(
     if parts is not None:
         mean, scale = lax.pcast((mean, scale), parts.axes, to="varying")
     weights = _cut(weights[:, None], rows)[:, 0]
-    return _design(points, weights, mean, scale), weights
+    return _design(rows, points, weights, mean, scale), weights
 
 
 def _cut(array: Float[Array, "N D"], rows: int) -> Float[Array, "T D n"]:
@@ -158,17 +162,27 @@ def _cut(array: Float[Array, "N D"], rows: int) -> Float[Array, "T D n"]:
     return array.reshape(-1, rows, array.shape[1]).transpose(0, 2, 1)
 
 
-@jax.custom_jvp
+def _present(count: int, rows: int, tile: Array) -> Array:
+    """Which places of a tile hold one of so many points."""
+    return tile * rows + jnp.arange(rows) < count
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _design(
-    points: Float[Array, "N D"], weights: Float[Array, "T n"], mean: Float[Array, " D"], scale: Float[Array, ""]
+    rows: int,
+    points: Float[Array, "N D"],
+    weights: Float[Array, "T n"] | None,
+    mean: Float[Array, " D"],
+    scale: Float[Array, ""],
 ) -> Float[Array, "T D_2 n"]:
     """Tiles of points as `Tiles` holds them, made one by one: all at once would hold the points two more times on the way."""
-    tiles, rows = weights.shape
+    count, tiles = points.shape[0], -(-points.shape[0] // rows)
 
     def put(at: Array, blocks: Array) -> Array:
         cut = points.at[at * rows + jnp.arange(rows)].get(mode="fill", fill_value=0, indices_are_sorted=True)
         # A point of weight 0 may hold anything finite; it must not reach the sums.
-        inside = jnp.where(weights[at] > 0, (cut.T - mean[:, None]) / scale, 0)
+        held = _present(count, rows, at) if weights is None else weights[at] > 0
+        inside = jnp.where(held, (cut.T - mean[:, None]) / scale, 0)
         # With its squared length and a 1 beside each point, distances and sums are one matrix product each.
         longer = [inside, jnp.square(inside).sum(axis=0, keepdims=True), jnp.ones_like(inside[:1])]
         return blocks.at[at].set(jnp.concatenate(longer))
@@ -177,14 +191,16 @@ def _design(
     return lax.fori_loop(0, tiles, put, jnp.full((tiles, mean.size + 2, rows), scale))
 
 
-def _design_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Any]:
+def _design_jvp(rows: int, primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Any]:
     # Only the points are moved here; backward through the loop each tile would pass over a gradient of the size of all points.
-    _, weights, mean, scale = primals
-    blocks = _design(*primals)
+    _, weights, _, scale = primals
+    blocks = _design(rows, *primals)
     if isinstance(tangents[0], SymbolicZero):
         return blocks, jax.custom_derivatives.zero_from_primal(blocks)
-    moved = jnp.where(weights[:, None] > 0, _cut(tangents[0], weights.shape[1]) / scale, 0)
-    longer = 2 * (blocks[:, : mean.size] * moved).sum(axis=1, keepdims=True)
+    moved = _cut(tangents[0], rows) / scale
+    if weights is not None:
+        moved = jnp.where(weights[:, None] > 0, moved, 0)
+    longer = 2 * (blocks[:, : moved.shape[1]] * moved).sum(axis=1, keepdims=True)
     return blocks, jnp.concatenate([moved, longer, jnp.zeros_like(longer)], axis=1)
 
 
@@ -227,6 +243,14 @@ def sum_tiles(
     """
     step = jax.checkpoint(lambda sums, tile: (body(sums, *tile), None))
     parts = tiles.parts
+    if tiles.weights is None:
+        number, _, rows = tiles.blocks.shape
+
+        def alike(sums: Sums, tile: tuple[Array, Array]) -> tuple[Sums, None]:
+            block, at = tile
+            return step(sums, (block, _present(tiles.count, rows, at).astype(block.dtype)))
+
+        return lax.scan(alike, start, (tiles.blocks, jnp.arange(number)))[0]
     if parts is None:
         return lax.scan(step, start, (tiles.blocks, tiles.weights))[0]
 

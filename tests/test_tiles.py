@@ -34,9 +34,12 @@ def test_points_lie_in_their_tiles(weights):
     np.testing.assert_allclose(tiles.mean, mean, rtol=1e-13)
     np.testing.assert_allclose(tiles.spread, spread, rtol=1e-13)
     np.testing.assert_allclose(tiles.blocks, laid_out(X, w, mean, spread), atol=1e-12)
-    np.testing.assert_array_equal(np.asarray(tiles.weights).ravel()[:COUNT], w)
-    assert not np.asarray(tiles.weights).ravel()[COUNT:].any()
     assert int(tiles.present) == (w > 0).sum()
+    if weights is None:
+        assert tiles.weights is None
+    else:
+        np.testing.assert_array_equal(np.asarray(tiles.weights).ravel()[:COUNT], w)
+        assert not np.asarray(tiles.weights).ravel()[COUNT:].any()
 
 
 def test_derivative_by_points():
@@ -69,5 +72,7 @@ def test_memory_of_a_fit(weighted):
     weights = jax.ShapeDtypeStruct((count,), jnp.float32) if weighted else None
     fit = jax.jit(lambda x, seeds, weights: jf.fcm(x, seeds, weights=weights, memberships=False).centers)
     needs = fit.lower(x, seeds, weights).compile().memory_analysis().temp_size_in_bytes / (12 * count)
-    # Coordinates, squared length, 1 and weight make 2; the rest, a tile at a time, is 0.01 now. Twice the points were 3.7.
-    assert 2 <= needs < 2.1
+    # Coordinates, squared length, 1 and weight, where there is one, make 2; the rest, a tile at a time, is 0.02 now. Twice the
+    # points were 3.7.
+    held = 2 if weighted else 5 / 3
+    assert held <= needs < held + 0.1
