@@ -267,7 +267,7 @@ def _set_up_process() -> None:
     import jax
 
     # Tracing makes millions of short-lived objects: looking for cycles among them every 700 took a tenth of a run.
-    gc.set_threshold(100_000)
+    gc.set_threshold(1_000_000)
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return  # the user, or a test, has chosen
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfuzzy"
