@@ -29,7 +29,7 @@ INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
 # Only neighbours are tried together: centers nearer than this share of the sum of their reaches, or than the second one where
 # something hides most of so many places on the way between them; and so many pairs at most.
 NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 5, 16
-# Points looked at for that, of all groups together.
+# For that a fair share of all points is looked at: so many, and less than twice as many.
 LOOKED_AT = 50_000
 # Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
 HOLDS, HOLDS_OF_ALL = 0.9, 0.7

@@ -146,6 +146,7 @@ def compiling_ahead(count: int, dtype: Any, along_ray: bool) -> Iterator[None]:
     with _threads(1) as pool:
         if count <= CAPACITIES[0] or count > LARGE:
             nothing = stacked((), CAPACITIES[0] if count <= CAPACITIES[0] else MOST, dtype)
+            # What fails here fails again, aloud, in the search itself.
             pool.submit(fit_batch, nothing, np.ones(len(KINDS), bool), np.asarray(False), along_ray)
         yield
 

@@ -356,7 +356,7 @@ def plan(points: Float[ArrayLike, "N 3"], up: Float[ArrayLike, "3"]) -> np.ndarr
 def png(figure: Any, dpi: int = 110) -> bytes:
     """A figure as PNG; the same figure gives the same bytes."""
     file = io.BytesIO()
-    layout = figure.get_layout_engine()
+    layout, before = figure.get_layout_engine(), figure.dpi
     try:
         # Laid out by us, a figure is drawn once; saving draws one that has its layout to find twice.
         if layout is not None:
@@ -366,6 +366,7 @@ def png(figure: Any, dpi: int = 110) -> bytes:
         # The default level of compression takes two thirds of the time of drawing, to save a tenth of the bytes.
         figure.savefig(file, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"compress_level": 3})
     finally:
+        figure.set_dpi(before)
         figure.set_layout_engine(layout)
     return file.getvalue()
 

@@ -241,24 +241,24 @@ def sum_tiles(
         start: Sums of nothing.
         join: Makes one of the sums of all devices.
     """
-    step = jax.checkpoint(lambda sums, tile: (body(sums, *tile), None))
-    parts = tiles.parts
-    if tiles.weights is None:
-        number, _, rows = tiles.blocks.shape
+    parts, weights = tiles.parts, tiles.weights
+    number, _, rows = tiles.blocks.shape
 
-        def alike(sums: Sums, tile: tuple[Array, Array]) -> tuple[Sums, None]:
-            block, at = tile
-            return step(sums, (block, _present(tiles.count, rows, at).astype(block.dtype)))
+    @jax.checkpoint
+    def step(sums: Sums, tile: tuple[Array, Array]) -> tuple[Sums, None]:
+        block, w = tile
+        if weights is None:  # then w is the number of the tile
+            w = _present(tiles.count, rows, w).astype(block.dtype)
+        return body(sums, block, w), None
 
-        return lax.scan(alike, start, (tiles.blocks, jnp.arange(number)))[0]
-    if parts is None:
-        return lax.scan(step, start, (tiles.blocks, tiles.weights))[0]
+    if parts is None or weights is None:
+        return lax.scan(step, start, (tiles.blocks, jnp.arange(number) if weights is None else weights))[0]
 
     def part(blocks: Array, weights: Array) -> Sums:
         begin = jax.tree.map(lambda zero: lax.pcast(zero, parts.axes, to="varying"), start)
         return join(parts, lax.scan(step, begin, (blocks, weights))[0])
 
-    return parts.each(part, tiles.blocks, tiles.weights, whole=True)
+    return parts.each(part, tiles.blocks, weights, whole=True)
 
 
 def map_tiles(tiles: Tiles, body: Callable[[Array], Any]) -> Any:
