@@ -127,10 +127,25 @@ def look(candidates: Candidates, counts: Counts, view: View, met: Meeting) -> Re
     )
 
 
+class Seen(NamedTuple):
+    """How H candidates explain N points.
+
+    Attributes:
+        square: Squared residual of each point in deviations (H, N).
+        variance: Of the error, in units of the point's own (H, N).
+        part: Which part of the surface each ray met (H, N).
+    """
+
+    square: Array
+    variance: Array
+    part: Array
+
+
 class _State(NamedTuple):
     candidates: Candidates
     turns: Array | None
     met: Meeting
+    seen: Seen
     cost: Array
 
 
@@ -142,7 +157,7 @@ def descend(
     thresholds: tuple[float, ...],
     largest: float,
     lids: bool,
-) -> tuple[Candidates, Array | None, Array]:
+) -> tuple[Candidates, Array | None, Array, Seen]:
     """One damped Gauss-Newton step a threshold, all candidates at once.
 
     Args:
@@ -155,33 +170,35 @@ def descend(
         lids: Whether bodies of revolution may have ends.
 
     Returns:
-        Candidates, their rotations, and the objective of each before the last step.
+        Candidates, their rotations, and in the end the objective of each and how it explains the points.
     """
-    # One look more than steps: at the first nothing is known yet of where rays meet surfaces, and nothing moves.
-    steps = jnp.asarray((thresholds[0], *thresholds), candidates.theta.dtype)
+    # Two looks more than steps: at the first nothing is known yet of where rays meet surfaces, the last is at what was found;
+    # at neither does anything move. A compiler works out twice what stands in a program twice.
+    steps = jnp.asarray((thresholds[0], *thresholds, thresholds[-1]), candidates.theta.dtype)
     size = 5 if turns is None else 7
     see = lambda turns: view if turns is None else rays.turned(view, turns)
 
     def step(i: int, state: _State) -> _State:
-        now, turns, met, _ = state
+        now, turns, met, *_ = state
         # Where rays meet surfaces is carried from step to step, else the compiler works it out once for every derivative.
         r = look(now, counts, see(turns), met)
-        square = (r.error**2 + r.miss**2) / steps[i] ** 2
+        seen = Seen(r.error**2 + r.miss**2, r.variance, met.part)
+        square = seen.square / steps[i] ** 2
         u = 1 / (1 + square)
         cost = (view.mask * square * u).sum(-1)
         columns = [*r.slopes, r.error] if turns is None else [*r.slopes, r.spins[0], r.spins[2], r.error]
         rows = jnp.stack(columns, 1) * (jnp.sqrt(view.mask) * u)[:, None]
         move = _move(jnp.einsum("hin,hjn->hij", rows, rows), now.free[:, :size])
-        move = jnp.clip(move, -largest, largest) * (i > 0)
+        move = jnp.where((i > 0) & (i <= len(thresholds)), jnp.clip(move, -largest, largest), 0.0)
         now = now._replace(theta=now.theta + move[:, :5])
         turns = None if turns is None else starts.rotation(move[:, 5], move[:, 6]) @ turns
-        return _State(now, turns, meet(now, counts, see(turns), lids), cost)
+        return _State(now, turns, meet(now, counts, see(turns), lids), seen, cost)
 
     blank = jnp.zeros((len(candidates.theta), len(view.gain)), candidates.theta.dtype)
     nowhere = Meeting(blank, blank, blank.astype(jnp.int32))
-    start = _State(candidates, turns, nowhere, jnp.zeros_like(blank[:, 0]))
+    start = _State(candidates, turns, nowhere, Seen(blank, blank, nowhere.part), jnp.zeros_like(blank[:, 0]))
     end = lax.fori_loop(0, len(steps), step, start)
-    return end.candidates, end.turns, end.cost
+    return end.candidates, end.turns, end.cost, end.seen
 
 
 def _move(normal: Array, free: Array) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.rays import Residual, View, columns
+from jaxfuzzy.rays import View, columns
 
 EM_STEPS = 4
 HALF_LOG_2PI = 0.9189385332046727
@@ -42,20 +42,17 @@ class Mixture(NamedTuple):
     ownership: Array
 
 
-def mixture(residual: Residual, view: View, depth_range: Array, scale_bounds: tuple[float, float]) -> Mixture:
-    """Likelihood of each candidate, its share and scale fitted by EM."""
-    square = residual.error**2 + residual.miss**2
+def mixture(
+    square: Array, variance: Array, view: View, depth_range: Array, scale_bounds: tuple[float, float]
+) -> Mixture:
+    """Likelihood of each candidate, its share and scale fitted by EM, from squared residuals in deviations and their variances."""
     # Both densities are per unit of depth in units of the point's own deviation.
     outside = -jnp.log(depth_range * view.gain)
+    wider = 0.5 * jnp.log(variance)
     count = view.mask.sum() + 1e-9
 
     def logs(background: Array, scale: Array) -> tuple[Array, Array]:
-        surface = (
-            -0.5 * square / (scale**2)[:, None]
-            - jnp.log(scale)[:, None]
-            - 0.5 * jnp.log(residual.variance)
-            - HALF_LOG_2PI
-        )
+        surface = -0.5 * square / (scale**2)[:, None] - jnp.log(scale)[:, None] - wider - HALF_LOG_2PI
         return jnp.log1p(-background)[:, None] + surface, jnp.log(background)[:, None] + outside
 
     def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -77,13 +74,12 @@ def mixture(residual: Residual, view: View, depth_range: Array, scale_bounds: tu
     )
 
 
-def gric(residual: Residual, mask: Array, parameters: Array) -> Array:
+def gric(square: Array, mask: Array, parameters: Array) -> Array:
     """Torr's geometric robust information criterion for surfaces, Σ min(e²/σ², 2) + k ln(3 n); lower is better.
 
     Torr, "Bayesian model estimation and selection for epipolar geometry and generic manifold fitting", IJCV 50(1), 2002; the term
     in the dimension of the manifold is the same for all surfaces and left out.
     """
-    square = residual.error**2 + residual.miss**2
     return (mask * jnp.minimum(square, 2.0)).sum(-1) + parameters * jnp.log(3 * mask.sum())
 
 

@@ -85,15 +85,19 @@ def _ended(
     many = jnp.tile(jnp.repeat(sides, len(height), axis=0), (2, 1))
     many = many.at[:, 4].set(jnp.where(ends == rays.CLOSED, tried, floor))
     rimmed = vessels_of(many, ends, tried, jnp.tile(jnp.repeat(steep, len(height)), 2))
-    cost = price(rays.meet_revolution(many, rimmed.detail, few), few).reshape(-1, len(height))
-    rimmed = rimmed.take(jnp.argmin(cost, -1) + jnp.arange(len(cost)) * len(height))
 
+    # The lid that was found, with bodies of a grid below it.
     theta = starts.lid_bodies(few, jnp.stack([window.cylinders[-1], window.cones[-1]]), lid)
     straight = theta[:, 3] == 0
     lidded = vessels_of(theta, rays.CLOSED * jnp.ones_like(theta[:, 4]), theta[:, 4], ~straight)
-    cost = price(rays.meet_revolution(theta, lidded.detail, few), few, 2 * SCREEN) + absurd(theta[:, 2])
-    pair = jnp.stack([jnp.argmin(jnp.where(kept, cost, jnp.inf)) for kept in (straight, ~straight)])
-    return joined([rimmed, lidded.take(pair)])
+
+    tried_all, n = joined([rimmed, lidded]), len(many)
+    threshold = jnp.where(jnp.arange(len(tried_all.theta)) < n, SCREEN, 2 * SCREEN)[:, None]
+    cost = price(rays.meet_revolution(tried_all.theta, tried_all.detail, few), few, threshold)
+    rim = jnp.argmin(cost[:n].reshape(-1, len(height)), -1) + jnp.arange(n // len(height)) * len(height)
+    below = cost[n:] + absurd(theta[:, 2])
+    pair = jnp.stack([jnp.argmin(jnp.where(kept, below, jnp.inf)) for kept in (straight, ~straight)])
+    return tried_all.take(jnp.concatenate([rim, n + pair]))
 
 
 def _bowls(sphere: Array, few: View, window: starts.Windows, height: Array) -> Candidates:

@@ -142,11 +142,12 @@ def _judge(
     item = {"points": points, "rays": directions, "eye": eye, "gain": gain, "weight": jnp.ones_like(gain)}
     view = _view(item, along_ray)
     met = polish.met_by(family, theta, turn, detail, view)
-    residual = polish.residual_of(family, theta, turn, detail, view, met)
-    return (residual.error**2 + residual.miss**2)[0], met.depth[0], met.part[0]
+    square, _, _ = polish.residual_of(family, theta, turn, detail, view, met)
+    return square, met.depth[0], met.part[0]
 
 
-@partial(jax.jit, static_argnames="kind")
+# Run once a call on a few numbers: optimising the code takes longer than it saves.
+@partial(jax.jit, static_argnames="kind", compiler_options={"xla_backend_optimization_level": 0})
 def assemble_batch(
     kind: str, theta: Array, covariance: Array, turn: Array, detail: Array, ends: Array, frame: Frame
 ) -> tuple[Primitive, Array]:

@@ -45,24 +45,28 @@ class Patches(NamedTuple):
 
 def patches(view: View, anchor: Array) -> Patches:
     """Robust quadratic fits round anchors (W, 3)."""
-    point = view.point[0].T
-    window = jnp.exp(-((anchor[:, None] - point) ** 2).sum(-1) / (2 * WIDTH**2)) * view.mask
+    point = view.point[0]
+    window = (
+        jnp.exp(-sum((a[:, None] - c) ** 2 for a, c in zip(anchor.T, point, strict=True)) / (2 * WIDTH**2)) * view.mask
+    )
     total = window.sum(-1) + 1e-9
-    mean = (window @ point) / total[:, None]
-    offset = point - mean[:, None]
-    scatter = jnp.einsum("wn,wni,wnj->wij", window, offset, offset) / total[:, None, None]
+    mean = (window @ point.T) / total[:, None]
+    offset = point - mean[:, :, None]
+    scatter = jnp.einsum("win,wjn->wij", offset * window[:, None], offset) / total[:, None, None]
     eye3 = jnp.eye(3, dtype=point.dtype)
     level = jnp.einsum("wii->w", scatter)[:, None, None] * 1e-5 + 1e-9
     inverse = starts.invert(scatter + level * eye3, jnp.broadcast_to(eye3, scatter.shape))
-    normal = jnp.broadcast_to(jnp.array([0.57, 0.31, -0.76], point.dtype), mean.shape)
-    for _ in range(6):
+
+    def power(_: int, normal: Array) -> Array:
         normal = (inverse * normal[:, None, :]).sum(-1)
-        normal = normal * lax.rsqrt((normal**2).sum(-1, keepdims=True) + 1e-30)
+        return normal * lax.rsqrt((normal**2).sum(-1, keepdims=True) + 1e-30)
+
+    normal = lax.fori_loop(0, 6, power, jnp.broadcast_to(jnp.array([0.57, 0.31, -0.76], point.dtype), mean.shape))
     least = jnp.abs(normal) == jnp.abs(normal).min(-1, keepdims=True)
     first = jnp.cross(normal, least.astype(point.dtype))
     first = first * lax.rsqrt((first**2).sum(-1, keepdims=True) + 1e-30)
     second = jnp.cross(normal, first)
-    s, t, h = (jnp.einsum("wni,wi->wn", offset, axis) / WIDTH for axis in (first, second, normal))
+    s, t, h = (jnp.einsum("win,wi->wn", offset, axis) / WIDTH for axis in (first, second, normal))
     terms = jnp.stack([jnp.ones_like(s), s, t, s * s, s * t, t * t, h], 1)
     start = jnp.sqrt((window * h**2).sum(-1) / total) + 1e-6
 

@@ -5,6 +5,7 @@ are the probabilities of belonging to the surface; they fall off for good points
 does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Jᵀ (Huber, Robust Statistics, 1981).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -48,6 +49,15 @@ class Polished(NamedTuple):
     moved: Array
 
 
+class _Look(NamedTuple):
+    """What one look at the points gives: derivatives (7, N), residual, its square, membership."""
+
+    rows: Array
+    error: Array
+    square: Array
+    own: Array
+
+
 class _State(NamedTuple):
     step: Array
     theta: Array
@@ -55,17 +65,10 @@ class _State(NamedTuple):
     scale: Array
     background: Array
     met: Meeting
+    look: _Look
     moved: Array
-
-
-class _Look(NamedTuple):
-    """What one look at the points gives: derivatives (7, N), residual, its square and variance, membership."""
-
-    rows: Array
-    error: Array
-    square: Array
-    variance: Array
-    own: Array
+    last: Array
+    done: Array
 
 
 def polish(
@@ -97,16 +100,12 @@ def polish(
     free, dtype = candidate.free, view.gain.dtype
     prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / LEAN_PRIOR**2 * free
 
-    def meet(theta: Array, turn: Array) -> Meeting:
-        return met_by(family, theta, turn, candidate.detail, view)
-
     def look(state: _State) -> _Look:
-        r = residual_of(family, state.theta, state.turn, candidate.detail, view, state.met)
-        square, scale = (r.error**2 + r.miss**2)[0], state.scale
-        on = -0.5 * (square / scale**2 + jnp.log(r.variance[0])) - jnp.log(scale) - HALF_LOG_2PI
+        square, log_variance, rows = residual_of(family, state.theta, state.turn, candidate.detail, view, state.met)
+        scale = state.scale
+        on = -0.5 * (square / scale**2 + log_variance) - jnp.log(scale) - HALF_LOG_2PI
         odds = on + jnp.log1p(-state.background) - jnp.log(state.background) - outside
-        rows = jnp.concatenate([*r.slopes, r.spins[0], r.spins[2]], 0) * free[:, None]
-        return _Look(rows, r.error[0], square, r.variance[0], jax.nn.sigmoid(odds) * view.mask)
+        return _Look(rows[1:] * free[:, None], rows[0], square, jax.nn.sigmoid(odds) * view.mask)
 
     def normal(theta: Array, rows: Array, weight: Array, scale: Array) -> Array:
         matrix = (rows * weight) @ rows.T / scale**2 + jnp.diag(prior)
@@ -117,35 +116,37 @@ def polish(
 
     def step(state: _State) -> _State:
         theta, turn, scale, background = state.theta, state.turn, state.scale, state.background
+        # At the first look nothing is known yet of where rays meet the surface; the last is at where it came to rest.
+        still = (state.step == 0) | state.last
         seen = look(state)
         lean = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[1, 0] - turn[0, 1]])
         downhill = (seen.rows * seen.own) @ seen.error / scale**2 + prior * jnp.concatenate([jnp.zeros(5, dtype), lean])
         matrix = normal(theta, seen.rows, seen.own, scale)
         matrix = matrix + jnp.diag(1e-5 * jnp.diag(matrix))
         move = jnp.clip(-starts.invert(matrix, downhill[:, None])[:, 0] * free, -0.2, 0.2)
+        move = jnp.where(still, 0.0, move)
         total = seen.own.sum()
         to_scale = jnp.clip(jnp.sqrt((seen.own * seen.square).sum() / (total + 1e-9)), *scale_bounds)
         to_background = jnp.clip(1 - total / count, 1e-3, 0.999)
+        to_scale, to_background = jnp.where(still, scale, to_scale), jnp.where(still, background, to_background)
         # Noise and share matter to the parameters only through the weights: a hundredth as much.
         noise = jnp.maximum(jnp.abs(to_scale - scale), jnp.abs(to_background - background))
-        moved = jnp.maximum(jnp.abs(move).max(), 0.01 * noise)
+        moved = jnp.where(still, state.moved, jnp.maximum(jnp.abs(move).max(), 0.01 * noise))
         theta, turn = theta + move[:5], starts.rotation(move[5], move[6]) @ turn
-        return _State(state.step + 1, theta, turn, to_scale, to_background, meet(theta, turn), moved)
+        met = met_by(family, theta, turn, candidate.detail, view)
+        last = (moved <= tolerance) | (state.step >= MOST_STEPS)
+        return _State(state.step + 1, theta, turn, to_scale, to_background, met, seen, moved, last, state.last)
 
-    start = _State(
-        jnp.asarray(0),
-        candidate.theta,
-        turn,
-        scale,
-        background,
-        meet(candidate.theta, turn),
-        jnp.asarray(jnp.inf, dtype),
-    )
-    end = lax.while_loop(lambda s: (s.step < MOST_STEPS) & (s.moved > tolerance), step, start)
-    seen = look(end)
+    blank, no = jnp.zeros_like(view.gain), jnp.asarray(False)
+    nowhere = Meeting(blank[None], blank[None], blank[None].astype(jnp.int32))
+    unseen = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank)
+    far = jnp.asarray(jnp.inf, dtype)
+    start = _State(jnp.asarray(0), candidate.theta, turn, scale, background, nowhere, unseen, far, no, no)
+    end = lax.while_loop(lambda s: ~s.done, step, start)
+    seen = end.look
     # ψ = own · e and its derivative, with d(own)/de = -own (1 - own) e / scale².
     bend = seen.own * (1 - (1 - seen.own / jnp.maximum(view.mask, 1e-12)) * seen.error**2 / end.scale**2)
-    inverse = jnp.linalg.inv(normal(end.theta, seen.rows, bend, end.scale))
+    inverse = starts.invert(normal(end.theta, seen.rows, bend, end.scale), jnp.eye(7, dtype=dtype))
     meat = (seen.rows * (seen.own * seen.error / end.scale) ** 2) @ seen.rows.T / end.scale**2
     return Polished(
         theta=end.theta,
@@ -173,8 +174,15 @@ def met_by(family: Array, theta: Array, turn: Array, detail: Array, view: View) 
     return lax.switch(family, families, theta[None])
 
 
-def residual_of(family: Array, theta: Array, turn: Array, detail: Array, view: View, met: Meeting) -> Residual:
-    """How far the points lie from that surface (1, N)."""
+def residual_of(
+    family: Array, theta: Array, turn: Array, detail: Array, view: View, met: Meeting
+) -> tuple[Array, Array, Array]:
+    """How far the points lie from that surface.
+
+    Returns:
+        Squared residual (N,), logarithm of its variance (N,), and the residual with its derivatives by the five parameters and
+        by a lean about x and about z (8, N).
+    """
     seen, signs = rays.turned(view, turn[None]), detail[None]
     families = (
         lambda t: rays.plane(t, seen, met),
@@ -182,7 +190,15 @@ def residual_of(family: Array, theta: Array, turn: Array, detail: Array, view: V
         lambda t: rays.revolution(t, seen, met),
         lambda t: rays.sphere(t, seen, met),
     )
-    full = lambda f: (
-        lambda t: jax.tree.map(lambda a: jnp.broadcast_to(jnp.asarray(a, view.gain.dtype), met.depth.shape), f(t))
-    )
-    return lax.switch(family, [full(f) for f in families], theta[None])
+
+    def packed(of: Callable[[Array], Residual]) -> Callable[[Array], Array]:
+        def rows(t: Array) -> Array:
+            r = of(t)
+            each = (r.error**2 + r.miss**2, jnp.log(r.variance), r.error, *r.slopes, r.spins[0], r.spins[2])
+            return jnp.concatenate([jnp.broadcast_to(jnp.asarray(a, view.gain.dtype), met.depth.shape) for a in each])
+
+        return rows
+
+    # One array: a program hands arrays from branch to branch one by one.
+    found = lax.switch(family, [packed(f) for f in families], theta[None])
+    return found[0], found[1], found[2:]

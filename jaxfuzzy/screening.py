@@ -14,7 +14,7 @@ KEPT = 6
 SLOPES, SLOPED = (0.0, 0.3, 0.7), 4
 
 
-def price(met: Meeting, view: View, threshold: float = SCREEN) -> Array:
+def price(met: Meeting, view: View, threshold: float | Array = SCREEN) -> Array:
     """Σ D / (D + c²), the objective of one fuzzy variety beside a noise cluster at distance c, for m = 2."""
     square = (met.depth**2 + (met.miss / rays.SIDEWAYS) ** 2) * (view.gain / threshold) ** 2
     total = (square / (1 + square)) @ view.mask

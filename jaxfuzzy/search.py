@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxfuzzy import choice, local, starts
 from jaxfuzzy.arrays import Array
-from jaxfuzzy.candidates import Candidates, Counts, descend, look, meet
+from jaxfuzzy.candidates import Candidates, Counts, Seen, descend
 from jaxfuzzy.finalists import finalists
 from jaxfuzzy.rays import View, picked, taken, turned
 from jaxfuzzy.screening import screened
@@ -86,12 +86,12 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: A
     lid = starts.lid(few, patches.normal @ turn.T, patches.middle @ turn.T, patches.usable, company)
     window = starts.windows(few, anchors @ turn.T, lid.below)
     coarse, counts = screened(few, window, company)
-    coarse, _, cost = descend(coarse, counts, None, few, COARSE, 0.5, False)
+    coarse, _, cost, _ = descend(coarse, counts, None, few, COARSE, 0.5, False)
     fine, counts = finalists(coarse, cost, counts, few, window, company, lid)
     upright = jnp.broadcast_to(turn, (len(fine.theta), 3, 3))
-    fine, turns, _ = descend(fine, counts, upright, more, FINE, 0.2, view.ray is not None)
+    fine, turns, _, seen = descend(fine, counts, upright, more, FINE, 0.2, view.ray is not None)
     assert turns is not None
-    return _choose(fine, turns, counts, more, depth_range, allowed, gric)._replace(
+    return _choose(fine, turns, counts, seen, more, depth_range, allowed, gric)._replace(
         deviation=deviation,
         local=typical / deviation,
         normals=jnp.where(patches.usable[:, None], patches.normal, 0.0),
@@ -99,32 +99,36 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: A
 
 
 def _choose(
-    fine: Candidates, turns: Array, counts: Counts, more: View, depth_range: Array, allowed: Array, gric: Array
+    fine: Candidates,
+    turns: Array,
+    counts: Counts,
+    seen: Seen,
+    more: View,
+    depth_range: Array,
+    allowed: Array,
+    gric: Array,
 ) -> Found:
-    seen = turned(more, turns)
-    met = meet(fine, counts, seen, more.ray is not None)
-    residual = look(fine, counts, seen, met)
-    mixed = choice.mixture(residual, more, depth_range, SCALES)
+    mixed = choice.mixture(seen.square, seen.variance, more, depth_range, SCALES)
     count = more.mask.sum()
     planes, boxes, bodies, spheres = counts.slices()
     # The length of a plane's parameters means nothing.
     parameters = fine.free.sum(-1).at[planes].add(-1)
     likelihood = -mixed.log_likelihood + 0.5 * parameters * jnp.log(count)
-    score = jnp.where(gric, choice.gric(residual, more.mask, parameters), likelihood)
+    score = jnp.where(gric, choice.gric(seen.square, more.mask, parameters), likelihood)
     score = jnp.where(jnp.isfinite(score), score, 1e9).at[planes].add(-choice.PLANE_BONUS)
     # Free narrowing makes a body of revolution a cone.
     steep = fine.free[bodies, 3] > 0
-    tapers = choice.cone_tapers(fine.theta[bodies], mixed.ownership[bodies], seen.point[bodies, 1])
+    tapers = choice.cone_tapers(fine.theta[bodies], mixed.ownership[bodies], turns[bodies, 1] @ more.point[0])
     good = jnp.concatenate(
         [
             jnp.ones(counts.planes, bool),
             choice.faces_hold(
                 fine.theta[boxes],
                 fine.detail[boxes],
-                met.part[boxes],
+                seen.part[boxes],
                 mixed.ownership[boxes],
                 mixed.background[boxes],
-                seen._replace(point=seen.point[boxes], ray=None if seen.ray is None else seen.ray[boxes]),
+                turned(more, turns[boxes]),
             ),
             choice.stout(fine.theta[bodies, 2]) & (tapers | ~steep),
             choice.stout(fine.theta[spheres, 3]),

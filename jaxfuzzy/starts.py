@@ -70,7 +70,8 @@ def dense(view: View) -> Array:
     """Which points have company: local density above a fifth of the largest. Uniform outliers have little (N,)."""
     # Added up axis by axis: a sum over a last axis of three takes twelve times as long.
     square = sum((c[:, None] - c) ** 2 for c in view.point[0])
-    company = (jnp.exp(-square / (2 * COMPANY**2)) * view.mask).sum(-1) * view.mask
+    # A product with the mask, as one added up is no faster than its exponentials are one by one.
+    company = (jnp.exp(-square / (2 * COMPANY**2)) @ view.mask) * view.mask
     return (company > 0.2 * company.max()) & (view.mask > 0)
 
 
