@@ -21,7 +21,7 @@ from jaxfuzzy.primitives import Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
-Fit = Callable[[Sequence[np.ndarray], int], tuple[Shape, ...]]
+Fit = Callable[[Sequence[np.ndarray]], tuple[Shape, ...]]
 
 # Of a group that is part of a round body, this share lies inside it, or outside by so many noise distances; so does this share
 # of the body's own group, of which the second share at least must lie on its surface.
@@ -57,19 +57,18 @@ def by_shapes(
         across: The two directions (2, 3) of the plane objects stand on.
         parts: Their division by places.
         shapes: The shape of each group.
-        fit: Fits shapes to sets of points given by their indices, by the program compiled for so many points an object.
+        fit: Fits shapes to sets of points given by their indices.
         camera: Where the points were seen from (3,).
 
     Returns:
         The division and the shapes that came of it; the same records where nothing changed.
     """
-    largest = int(np.bincount(np.asarray(parts.labels) + 1, minlength=2)[1:].max())
-    parts, shapes, gathered = _gathered(points, parts, shapes, fit, largest)
+    parts, shapes, gathered = _gathered(points, parts, shapes, fit)
     members = members_of(parts)
     flat = points @ across.T
-    joined = _joined(points, flat, members, shapes, fit, largest, camera)
+    joined = _joined(points, flat, members, shapes, fit, camera)
     taken = gathered.union(*joined)
-    divided = _divided(points, flat, members, shapes, taken, fit, largest)
+    divided = _divided(points, flat, members, shapes, taken, fit)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []
@@ -90,7 +89,7 @@ def members_of(parts: Segmentation) -> list[np.ndarray]:
 
 
 def _gathered(
-    points: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit, largest: int
+    points: np.ndarray, parts: Segmentation, shapes: tuple[Shape, ...], fit: Fit
 ) -> tuple[Segmentation, tuple[Shape, ...], set[int]]:
     """Merges groups into the round body that they lie inside: the new division, its shapes, and which of them are merged ones."""
     members = members_of(parts)
@@ -101,7 +100,7 @@ def _gathered(
         a: np.sort(np.concatenate([members[a], *(members[b] for b in into if into[b] == a)])) for a in into.values()
     }
     groups: list[tuple[np.ndarray, Shape, int]] = []
-    anew = dict(zip(whole, fit(list(whole.values()), largest), strict=True))
+    anew = dict(zip(whole, fit(list(whole.values())), strict=True))
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
         if k in whole:
             # The outside names the body, unless a surface sought on the whole holds more of the outside too.
@@ -160,7 +159,6 @@ def _joined(
     members: Sequence[np.ndarray],
     shapes: Sequence[Shape],
     fit: Fit,
-    largest: int,
     camera: np.ndarray | None,
 ) -> dict[tuple[int, int], tuple[np.ndarray, Shape]]:
     """Pairs of groups that one surface holds, and that surface; each group is in one pair at most."""
@@ -178,7 +176,7 @@ def _joined(
     pairs = sorted(able_pairs, key=apart.__getitem__)[:MOST_PAIRS]
     both = [np.sort(np.concatenate([members[a], members[b]])) for a, b in pairs]
     good: list[tuple[float, tuple[int, int], tuple[np.ndarray, Shape]]] = []
-    for (a, b), own, shape in zip(pairs, both, fit(both, largest) if both else (), strict=True):
+    for (a, b), own, shape in zip(pairs, both, fit(both) if both else (), strict=True):
         if shape.primitive is None:
             continue
         held = own[np.asarray(shape.inliers)]
@@ -255,7 +253,6 @@ def _divided(
     shapes: Sequence[Shape],
     taken: set[int],
     fit: Fit,
-    largest: int,
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups that two surfaces hold much better than one, and these."""
     tried = {
@@ -270,7 +267,7 @@ def _divided(
         pieces = {k: [np.sort(own[side[k] == i]) for i in (0, 1)] for k, own in tried.items()}
         pieces = {k: two for k, two in pieces.items() if min(map(len, two)) >= max(FEWEST, SMALLEST * len(tried[k]))}
         sets = [piece for two in pieces.values() for piece in two]
-        found = iter(fit(sets, largest) if sets else ())
+        found = iter(fit(sets) if sets else ())
         tried = {k: tried[k] for k in pieces}
         for k, two in pieces.items():
             both = [(piece, next(found)) for piece in two]

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
-from jaxfuzzy.objects import CAPACITIES, DEVIATIONS, MOST, Prepared, batches, prepared, stacked, with_more
+from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, prepared, stacked, with_more
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
@@ -41,8 +41,6 @@ LEAST_SHARE = 0.1
 UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
-# Of a cloud of so many points the largest object is all but sure to have more than the smaller one of two compiled sizes.
-LARGE = 8 * MOST
 
 
 class Settings(NamedTuple):
@@ -135,19 +133,18 @@ def look_at(items: Sequence[Prepared], settings: Settings) -> list[Look]:
 
 
 @contextmanager
-def compiling_ahead(count: int, dtype: Any, along_ray: bool) -> Iterator[None]:
-    """Compiles the search beside what the block does, where the number of points tells for which size of objects.
+def compiling_ahead(capacity: int, dtype: Any, along_ray: bool) -> Iterator[None]:
+    """Compiles the search beside what the block does.
 
     Args:
-        count: Points of the whole cloud.
+        capacity: Points that an object will be fitted to at most.
         dtype: Their type.
         along_ray: Whether residuals will be along the viewing ray.
     """
     with _threads(1) as pool:
-        if count <= CAPACITIES[0] or count > LARGE:
-            nothing = stacked((), CAPACITIES[0] if count <= CAPACITIES[0] else MOST, dtype)
-            # What fails here fails again, aloud, in the search itself.
-            pool.submit(fit_batch, nothing, np.ones(len(KINDS), bool), np.asarray(False), along_ray)
+        nothing = stacked((), capacity, dtype)
+        # What fails here fails again, aloud, in the search itself.
+        pool.submit(fit_batch, nothing, np.ones(len(KINDS), bool), np.asarray(False), along_ray)
         yield
 
 

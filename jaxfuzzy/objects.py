@@ -15,8 +15,10 @@ import numpy as np
 DEVIATIONS = 2.5
 # Sizes that are compiled: points an object and objects a batch; an object that is not there costs nothing.
 CAPACITIES = (2048, 8192)
-# An object is fitted to so many of its points, evenly drawn: errors of stereo are alike over tens of pixels, so more say no more.
+# An object is fitted to so many of its points at most, evenly drawn; one of a scene, where hundreds of neighboring points err
+# alike, to fewer, so that all scenes share one program.
 MOST = CAPACITIES[-1]
+OF_SCENE = CAPACITIES[0]
 BATCH = 16
 GOLDEN = 0.6180339887498949
 # Height, and a trace of place for points of one height.

@@ -19,7 +19,7 @@ from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
-from jaxfuzzy.objects import MOST
+from jaxfuzzy.objects import OF_SCENE
 from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
@@ -203,7 +203,7 @@ def _model(
     thickness = 0.0
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
     along_ray = camera is not None and options.get("distance", "ray") == "ray"
-    with compiling_ahead(count, points.dtype, along_ray):
+    with compiling_ahead(OF_SCENE, points.dtype, along_ray):
         with clock.stage("ground"):
             if ground is not None:
                 found = fit_ground(
@@ -241,12 +241,12 @@ def _model(
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         places, eye = points[own], None if camera is None else np.asarray(camera)
         members = members_of(parts)
-        shapes = fit_members(places, members, rule=shape_rule, **seen(own), **picked)
+
+        def fit(sets: Sequence[np.ndarray]) -> tuple[Shape, ...]:
+            return fit_members(places, sets, rule=shape_rule, capacity=OF_SCENE, **seen(own), **picked)
+
+        shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
-
-            def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
-                return fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
-
             across = np.asarray(tangents(jnp.asarray(vertical)))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
             members = members_of(parts)
@@ -295,7 +295,7 @@ def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane) -> np.ndarr
 def _with_correlated_errors(shape: Shape) -> Shape:
     """The shape with the covariance of points of which many neighbors err alike."""
     count = max(len(shape.inliers), 1)
-    worth = max(1.0, PIXELS_PER_POINT * min(count, MOST) / count)
+    worth = max(1.0, PIXELS_PER_POINT * min(count, OF_SCENE) / count)
     return dataclasses.replace(
         shape, covariance=jnp.asarray(np.asarray(shape.covariance) * worth, shape.covariance.dtype)
     )

@@ -187,8 +187,8 @@ def fit_members(
         distance: See there.
         rule: See there.
         weights: See there.
-        capacity: Points an object of the earlier call whose compiled program is to be used again; 0 to choose by the sets. Larger
-            sets are fitted to a fair sample, and all their points judged.
+        capacity: Points that a set is fitted to at most; 0 to choose by the sets. Larger sets are fitted to a fair sample, and all
+            their points judged.
     """
     array = checks.places(points)
     count = len(array)

@@ -37,7 +37,7 @@ def shape_of(points, body, noise=0.005):
 def fitted_to(points, bodies):
     """Takes for every set the body that holds most of it."""
 
-    def fit(sets, capacity):
+    def fit(sets):
         best = lambda own: max((shape_of(points[own], s) for s in bodies), key=lambda s: int(s.inliers.sum()))
         return tuple(best(own) for own in sets)
 
