@@ -30,7 +30,7 @@ INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
 # something hides most of so many places on the way between them; and so many pairs at most.
 NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 5, 16
 # For that a fair share of all points is looked at: so many, and less than twice as many.
-LOOKED_AT = 50_000
+LOOKED_AT = 12_000
 # Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
 HOLDS, HOLDS_OF_ALL = 0.9, 0.7
 # A group of which one surface holds this share is one object. Two surfaces must hold this share of the others, and this much

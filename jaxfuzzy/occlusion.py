@@ -18,8 +18,8 @@ from jaxfuzzy.status import Status
 
 # Points within this share of an extent from its end are asked what is seen beyond; more where points are this sparse.
 STRIP, SPACINGS = 0.1, 3.0
-# So many of them at most, and at least.
-MOST_ASKED, FEWEST_ASKED = 128, 8
+# So many of them at most, and at least; and so many tell how dense the points are.
+MOST_ASKED, FEWEST_ASKED, SAMPLE = 128, 8, 32
 # A view is blocked where so many points are nearer, within the reach of so many points of the sparser of the two: what is looked
 # at and what stands before it. Outliers are so sparse only where they are as many as the points of the shape.
 IN_FRONT, NEIGHBOURS = 4, 8
@@ -136,7 +136,7 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
 def _sight(ray: np.ndarray, depth: np.ndarray) -> Sight:
     if len(ray) <= NEIGHBOURS:
         return Sight(ray, depth, 0.0)
-    some = ray[np.linspace(0, len(ray) - 1, min(len(ray), MOST_ASKED)).astype(int)]
+    some = ray[np.linspace(0, len(ray) - 1, min(len(ray), SAMPLE)).astype(int)]
     square = np.maximum(2 - 2 * some @ ray.T, 0)
     return Sight(ray, depth, float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS]))))
 

@@ -66,7 +66,7 @@ def test_two_parts_of_one_ball_are_merged_and_a_stranger_is_not():
     parts = divided(points, np.array([0, 1, 2]))
     fit = fitted_to(points, [Sphere(jnp.array([0, 0, 1.0]), jnp.asarray(0.15)), Sphere(jnp.array([0.6, 0, 1.0]), 0.05)])
     members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)]
-    merged, shapes = by_shapes(points, ACROSS, parts, fit(members, 0), fit)
+    merged, shapes = by_shapes(points, ACROSS, parts, fit(members), fit)
     assert merged.k == len(shapes) == 2
     labels = np.asarray(merged.labels)
     assert len(set(labels[: len(cut)]) - {-1}) == 1
@@ -81,7 +81,7 @@ def test_two_balls_that_touch_are_told_apart():
     parts = segment(points, ks=(1,))
     spheres = [Sphere(jnp.array([x, 0, 1.0]), jnp.asarray(0.1)) for x in (0.0, 0.2)]
     fit = fitted_to(points, spheres)
-    one = fit([np.flatnonzero(np.asarray(parts.labels) == 0)], 0)
+    one = fit([np.flatnonzero(np.asarray(parts.labels) == 0)])
     apart, shapes = by_shapes(points, ACROSS, parts, one, fit)
     assert apart.k == len(shapes) == 2
     labels = np.asarray(apart.labels)
@@ -89,7 +89,7 @@ def test_two_balls_that_touch_are_told_apart():
     assert {shape.kind for shape in shapes} == {"sphere"}
     # A group that one surface holds stays whole.
     alone = segment(points[:300], ks=(1,))
-    held = fit([np.flatnonzero(np.asarray(alone.labels) == 0)], 0)
+    held = fit([np.flatnonzero(np.asarray(alone.labels) == 0)])
     same, _ = by_shapes(points[:300], ACROSS, alone, held, fit)
     assert same is alone
 
@@ -118,7 +118,7 @@ def test_what_lies_inside_a_round_body_is_part_of_it():
     parts = divided(points, np.array([0, 1, 2]))
     fit = fitted_to(points, bodies)
     members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)]
-    merged, shapes = by_shapes(points, ACROSS, parts, fit(members, 0), fit)
+    merged, shapes = by_shapes(points, ACROSS, parts, fit(members), fit)
     assert merged.k == 2
     labels = np.asarray(merged.labels)
     assert len(set(labels[:1000]) - {-1}) == 1
@@ -133,7 +133,7 @@ def test_a_vessel_in_one_group_is_not_divided():
     points, bodies = vessel()
     parts = segment(points, ks=(1,))
     fit = fitted_to(points, bodies)
-    same, _ = by_shapes(points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)], 0), fit)
+    same, _ = by_shapes(points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)]), fit)
     assert same is parts
 
 
@@ -149,7 +149,7 @@ def test_halves_far_apart_are_merged_where_something_hides_what_is_between():
         Sphere(jnp.array([0, 0, 0.6]), jnp.asarray(0.045)),
     ]
     fit = fitted_to(points, bodies)
-    shapes = fit([np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)], 0)
+    shapes = fit([np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)])
     # Without a camera, or with one that sees between them, they are too far apart to be tried.
     for camera in (None, np.array([0, 5.0, 1.0])):
         assert by_shapes(points, ACROSS, parts, shapes, fit, camera)[0] is parts
