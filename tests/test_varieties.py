@@ -30,7 +30,6 @@ START = 0.7 * OWN + 0.3 * np.random.default_rng(1).dirichlet([1, 1], 280)
 WEIGHTS = np.random.default_rng(2).uniform(0.2, 2, len(POINTS))
 PAIR = ("4d", "6d")
 ONE, ALL = POINTS[:140], np.ones((140, 1))
-COUNTS = np.random.default_rng(6).permutation(np.repeat([0, 1, 2, 1], 35))
 
 
 @pytest.mark.parametrize(("names", "dimension"), [(("4d", "6d"), None), (("3d", "6d"), 2)])
@@ -146,13 +145,13 @@ def test_embeddings_side_by_side_are_as_one_by_one_and_padding_is_none(distance)
 
 @pytest.mark.parametrize("distance", ["algebraic", "geometric"])
 def test_hostile_padding_is_no_padding(distance):
-    # As many points with padding as alone, some twice, so that the programs are those of other tests.
     rng = np.random.default_rng(5)
-    pad = COUNTS[:, None] == 0
-    padded, start = np.where(pad, 1e6 * rng.normal(size=(140, 3)), ONE), np.where(pad, rng.uniform(size=(140, 1)), ALL)
+    where = np.sort(rng.choice(160, 140, replace=False))
+    padded, start, weights = 1e6 * rng.normal(size=(160, 3)), rng.uniform(size=(160, 1)), np.zeros(160)
+    padded[where], start[where], weights[where] = ONE, ALL, 1
     options = {"embedding": "cylinder", "noise_distance": 0.3, "distance": distance, "solver": TIGHT}
-    alone, fit = nfcv(np.repeat(ONE, COUNTS, 0), ALL, **options), nfcv(padded, start, weights=COUNTS, **options)
-    np.testing.assert_allclose(np.repeat(fit.memberships, COUNTS, 0), alone.memberships, atol=800 * EPS)
+    alone, fit = nfcv(ONE, ALL, **options), nfcv(padded, start, weights=weights, **options)
+    np.testing.assert_allclose(fit.memberships[where], alone.memberships, atol=800 * EPS)
     np.testing.assert_allclose(fit.centers, alone.centers, atol=800 * EPS)
     np.testing.assert_allclose(fit.bounds, alone.bounds, atol=800 * EPS)
     assert int(fit.status) == int(alone.status) == 0
@@ -160,9 +159,10 @@ def test_hostile_padding_is_no_padding(distance):
 
 
 def test_weights_count_points():
+    counts = np.random.default_rng(6).permutation(np.repeat([0, 1, 2, 1], 35))
     options = {"embedding": "cylinder", "noise_distance": 0.3, "solver": TIGHT}
-    weighted, repeated = nfcv(ONE, ALL, weights=COUNTS, **options), nfcv(np.repeat(ONE, COUNTS, 0), ALL, **options)
-    np.testing.assert_allclose(np.repeat(weighted.memberships, COUNTS, 0), repeated.memberships, atol=800 * EPS)
+    weighted, repeated = nfcv(ONE, ALL, weights=counts, **options), nfcv(np.repeat(ONE, counts, 0), ALL, **options)
+    np.testing.assert_allclose(np.repeat(weighted.memberships, counts, 0), repeated.memberships, atol=800 * EPS)
     np.testing.assert_allclose(weighted.objective, repeated.objective, rtol=800 * EPS)
 
 
