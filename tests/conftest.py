@@ -24,3 +24,11 @@ def _few_programs():
     """Compiled programs hold memory maps, of which Linux grants a process 65,530; XLA crashes beyond them."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(scope="module")
+def compiled_for_one_run():
+    """For small data and many programs: optimising the code takes longer than it saves."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

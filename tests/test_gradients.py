@@ -136,7 +136,7 @@ def test_step_derivative_is_that_of_the_step():
         def flat_step(y, unravel=unravel, args=args, sizes=sizes):
             return ravel_pytree(step(unravel(y), args, sizes=sizes, powers=smooth_powers, exact=True)[0])[0]
 
-        expected = jax.jacfwd(flat_step)(flat)
+        expected = jax.jit(jax.jacfwd(flat_step))(flat)
         np.testing.assert_allclose(step_jacobian(theta, args, sizes=sizes), expected, atol=1e-13)
 
 

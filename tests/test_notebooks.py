@@ -9,24 +9,19 @@ nbformat = pytest.importorskip("nbformat", reason="notebooks need the extra note
 nbclient = pytest.importorskip("nbclient", reason="notebooks need the extra notebooks")
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-# These compile for long; run them with: python -m pytest -m slow tests/test_notebooks.py
-SLOW = {"2_own_pair", "4_shapes_and_ransac", "5_tuning"}
-NOTEBOOKS = [
-    pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in SLOW else [])
-    for path in sorted(FOLDER.glob("*.ipynb"))
-]
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 
 def test_all_are_there():
-    assert {path.stem for path in FOLDER.glob("*.ipynb")} > SLOW
     assert len(NOTEBOOKS) == 6
 
 
 @pytest.mark.filterwarnings("ignore")  # of Jupyter's own packages
-@pytest.mark.parametrize("path", NOTEBOOKS)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     book = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in book.cells), "outputs are not kept"
+    # What one has compiled another takes: the objects of 4 are as large as those of 2, whose search takes longest to compile.
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.jax_compilation_cache_dir))
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
     # Everything is compiled for one run, so optimising the code takes longer than it saves.

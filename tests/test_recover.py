@@ -8,6 +8,8 @@ from jaxfuzzy.recover import CAN_BE, holds, recover
 from jaxfuzzy.solve import Solver
 from jaxfuzzy.varieties import nfcv
 
+pytestmark = pytest.mark.usefixtures("compiled_for_one_run")
+
 COUNT, OUTLIERS, DEVIATION = 500, 60, 0.002
 EMBEDDINGS = ("3d", "4d", "6d", "cylinder", "sphere", "cone", "9d")
 PLACE = np.array([0.3, -0.1, 1.1])
@@ -114,11 +116,11 @@ def test_what_does_not_hold_is_a_quadric(fits, kind, embedding):
 
 def test_completing_squares_by_hand():
     """On (x - 1)² + (z - 4)² = 4 the squares leave a = 1, b = 4, r = 2 exactly, whatever the distance."""
-    angle = np.arange(40) * 0.1
-    points = np.stack([1 + 2 * np.sin(angle), np.arange(40) % 4, 4 - 2 * np.cos(angle)], 1)
+    angle = np.arange(300) * 0.1
+    points = np.stack([1 + 2 * np.sin(angle), np.arange(300) % 4, 4 - 2 * np.cos(angle)], 1)
     for distance in ("geometric", "algebraic"):
         for embedding in ("cylinder", "4d"):
-            fit = nfcv(points, np.ones((40, 1)), embedding=embedding, distance=distance)
+            fit = nfcv(points, np.ones((300, 1)), embedding=embedding, distance=distance)
             cylinder = recover(fit, "cylinder")
             assert float(cylinder.radius) == pytest.approx(2, abs=1e-9)
             np.testing.assert_allclose(cylinder.base[jnp.array([0, 2])], [1, 4], atol=1e-9)
@@ -181,9 +183,9 @@ def test_box_from_its_faces(count):
 
 def test_patch_alike_in_both_directions_is_square():
     rng = np.random.default_rng(0)
-    turned = rng.uniform(-1, 1, (400, 2)) @ [[np.sqrt(0.5), np.sqrt(0.5)], [-np.sqrt(0.5), np.sqrt(0.5)]]
-    points = np.column_stack([turned, np.full(400, 3.0)])
-    plane = recover(nfcv(points, np.ones((400, 1)), embedding="3d"), "plane")
+    count = COUNT + OUTLIERS
+    turned = rng.uniform(-1, 1, (count, 2)) @ [[np.sqrt(0.5), np.sqrt(0.5)], [-np.sqrt(0.5), np.sqrt(0.5)]]
+    plane = recover(fitted(np.column_stack([turned, np.full(count, 3.0)])).pick("3d"), "plane")
     sides = np.linalg.norm(np.roll(plane.corners, -1, 0) - plane.corners, axis=1)
     np.testing.assert_allclose(sides, sides[0], rtol=0.05)
 
@@ -242,14 +244,14 @@ def test_batches_and_far_places():
 @pytest.mark.parametrize(
     ("embedding", "kind", "message"),
     [
-        (("3d", "6d"), "plane", r"varieties must be of one embedding, got 2: use varieties.pick\(name\)"),
+        ("all", "plane", r"varieties must be of one embedding, got 7: use varieties.pick\(name\)"),
         ("3d", "torus", "kind must be one of 'plane', 'box'.*, got 'torus'"),
         ("3d", "sphere", "kind must be one of 'plane', 'box', 'quadric' in the embedding '3d', got 'sphere'"),
         ("3d", "box", "kind 'box' must have two or three varieties, one a face, got 1"),
     ],
 )
-def test_wrong_arguments_are_named(embedding, kind, message):
-    fit = nfcv(cloud("plane"), np.ones((COUNT + OUTLIERS, 1)), embedding=embedding, noise_distance=0.01)
+def test_wrong_arguments_are_named(fits, embedding, kind, message):
+    fit = fits["plane"] if embedding == "all" else fits["plane"].pick(embedding)
     with pytest.raises(ValueError, match=message):
         recover(fit, kind)
     with pytest.raises(ValueError, match=message):
@@ -265,11 +267,12 @@ def test_which_variety():
         recover(fit, "plane", variety=2)
 
 
-def test_pick():
-    fits = nfcv(cloud("plane"), np.ones((COUNT + OUTLIERS, 1)), embedding=("3d", "6d"), noise_distance=0.01)
-    plane = fits.pick("3d")
+def test_pick(fits):
+    plane = fits["plane"].pick("3d")
     assert plane.centers.shape == (1, 3)
     assert plane.basis.shape == (1, 3, 2)
     assert plane.pick("3d") is plane
-    with pytest.raises(ValueError, match="embedding must be one of '3d', '6d', got '4d'"):
-        fits.pick("4d")
+    with pytest.raises(ValueError, match="embedding must be one of '3d', got '4d'"):
+        plane.pick("4d")
+    with pytest.raises(ValueError, match=r"embedding must be one of '3d', '4d', '6d', .*, got '5d'"):
+        fits["plane"].pick("5d")

@@ -16,14 +16,7 @@ from jaxfuzzy.status import Status
 from jaxfuzzy.tuning import Hyper, tune
 from jaxfuzzy.varieties import nfcv
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _compiled_for_one_run():
-    """Small data and many programs: optimising the code takes longer than it saves."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
+pytestmark = pytest.mark.usefixtures("compiled_for_one_run")
 
 EXACT = Solver(max_steps=5_000, tol=1e-13)
 GOOD = Hyper(1.4, jnp.array([0.3, 5.0]), jnp.array([0.0, 2.0, 0.5]))
