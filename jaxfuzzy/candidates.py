@@ -124,6 +124,7 @@ def look(candidates: Candidates, counts: Counts, view: View, met: Meeting) -> Re
         join(*(e.variance for e in each)),
         tuple(join(*(e.slopes[i] for e in each)) for i in range(5)),
         (spin(0), spin(1), spin(2)),
+        join(*(e.damping for e in each)),
     )
 
 

@@ -142,7 +142,7 @@ def _judge(
     item = {"points": points, "rays": directions, "eye": eye, "gain": gain, "weight": jnp.ones_like(gain)}
     view = _view(item, along_ray)
     met = polish.met_by(family, theta, turn, detail, view)
-    square, _, _ = polish.residual_of(family, theta, turn, detail, view, met)
+    square, *_ = polish.residual_of(family, theta, turn, detail, view, met)
     return square, met.depth[0], met.part[0]
 
 

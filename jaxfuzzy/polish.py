@@ -2,7 +2,8 @@
 
 The axis is free to lean, with a prior of ten degrees, so that an upright frame known to a few degrees does no harm. Weights
 are the probabilities of belonging to the surface; they fall off for good points too, which the plain inverse normal matrix
-does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Jᵀ (Huber, Robust Statistics, 1981).
+does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Ĵᵀ (Huber, Robust Statistics, 1981), J
+the derivatives that steps take and Ĵ the true ones: along a ray that grazes the surface the former are damped.
 """
 
 from collections.abc import Callable
@@ -20,6 +21,9 @@ from jaxfuzzy.rays import Meeting, Residual, View
 
 MOST_STEPS = 120
 LEAN_PRIOR = 0.1745
+# Below lie the last few points before a silhouette, where a surface bends away faster than a derivative tells.
+LEAST_DAMPING = 0.2
+MOST_LEVERAGE = 0.9
 PLANE, BOX, REVOLUTION, SPHERE = range(4)
 
 
@@ -50,11 +54,12 @@ class Polished(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """What one look at the points gives: derivatives (7, N), residual, its square, membership."""
+    """What one look at the points gives: derivatives (7, N), residual, its square, damping of derivatives, membership."""
 
     rows: Array
     error: Array
     square: Array
+    damping: Array
     own: Array
 
 
@@ -101,11 +106,13 @@ def polish(
     prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / LEAN_PRIOR**2 * free
 
     def look(state: _State) -> _Look:
-        square, log_variance, rows = residual_of(family, state.theta, state.turn, candidate.detail, view, state.met)
+        square, log_variance, damping, rows = residual_of(
+            family, state.theta, state.turn, candidate.detail, view, state.met
+        )
         scale = state.scale
         on = -0.5 * (square / scale**2 + log_variance) - jnp.log(scale) - HALF_LOG_2PI
         odds = on + jnp.log1p(-state.background) - jnp.log(state.background) - outside
-        return _Look(rows[1:] * free[:, None], rows[0], square, jax.nn.sigmoid(odds) * view.mask)
+        return _Look(rows[1:] * free[:, None], rows[0], square, damping, jax.nn.sigmoid(odds) * view.mask)
 
     def normal(theta: Array, rows: Array, weight: Array, scale: Array) -> Array:
         matrix = (rows * weight) @ rows.T / scale**2 + jnp.diag(prior)
@@ -139,15 +146,20 @@ def polish(
 
     blank, no = jnp.zeros_like(view.gain), jnp.asarray(False)
     nowhere = Meeting(blank[None], blank[None], blank[None].astype(jnp.int32))
-    unseen = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank)
+    unseen = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank, blank)
     far = jnp.asarray(jnp.inf, dtype)
     start = _State(jnp.asarray(0), candidate.theta, turn, scale, background, nowhere, unseen, far, no, no)
     end = lax.while_loop(lambda s: ~s.done, step, start)
     seen = end.look
     # ψ = own · e and its derivative, with d(own)/de = -own (1 - own) e / scale².
     bend = seen.own * (1 - (1 - seen.own / jnp.maximum(view.mask, 1e-12)) * seen.error**2 / end.scale**2)
+    # Steps take derivatives damped at grazing incidence; how residuals really change is the undamped ones.
+    bend = bend / jnp.maximum(seen.damping, LEAST_DAMPING)
     inverse = starts.invert(normal(end.theta, seen.rows, bend, end.scale), jnp.eye(7, dtype=dtype))
-    meat = (seen.rows * (seen.own * seen.error / end.scale) ** 2) @ seen.rows.T / end.scale**2
+    # Points far out on a surface pull it towards themselves, and by that much their residuals are too small.
+    leverage = seen.own / end.scale**2 * (seen.rows * (inverse @ seen.rows)).sum(0)
+    pull = seen.own * seen.error / end.scale / (1 - jnp.clip(leverage, 0.0, MOST_LEVERAGE))
+    meat = (seen.rows * pull**2) @ seen.rows.T / end.scale**2
     return Polished(
         theta=end.theta,
         turn=end.turn,
@@ -176,12 +188,12 @@ def met_by(family: Array, theta: Array, turn: Array, detail: Array, view: View) 
 
 def residual_of(
     family: Array, theta: Array, turn: Array, detail: Array, view: View, met: Meeting
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """How far the points lie from that surface.
 
     Returns:
-        Squared residual (N,), logarithm of its variance (N,), and the residual with its derivatives by the five parameters and
-        by a lean about x and about z (8, N).
+        Squared residual (N,), logarithm of its variance (N,), what its derivatives are damped by (N,), and the residual with these
+        derivatives, by the five parameters and by a lean about x and about z (8, N).
     """
     seen, signs = rays.turned(view, turn[None]), detail[None]
     families = (
@@ -194,11 +206,11 @@ def residual_of(
     def packed(of: Callable[[Array], Residual]) -> Callable[[Array], Array]:
         def rows(t: Array) -> Array:
             r = of(t)
-            each = (r.error**2 + r.miss**2, jnp.log(r.variance), r.error, *r.slopes, r.spins[0], r.spins[2])
+            each = (r.error**2 + r.miss**2, jnp.log(r.variance), r.damping, r.error, *r.slopes, r.spins[0], r.spins[2])
             return jnp.concatenate([jnp.broadcast_to(jnp.asarray(a, view.gain.dtype), met.depth.shape) for a in each])
 
         return rows
 
     # One array: a program hands arrays from branch to branch one by one.
     found = lax.switch(family, [packed(f) for f in families], theta[None])
-    return found[0], found[1], found[2:]
+    return found[0], found[1], found[2], found[3:]

@@ -68,6 +68,7 @@ class Residual(NamedTuple):
         variance: Of the error, in units of the point's own; on slanted surfaces errors sideways are errors of depth.
         slopes: Derivative of `error` by each of the five parameters, (H, N) each.
         spins: Derivative of `error` by a small turn of the points about x, y and z.
+        damping: What all derivatives were multiplied by where a ray grazes the surface, 1 elsewhere.
     """
 
     error: Array
@@ -75,6 +76,7 @@ class Residual(NamedTuple):
     variance: Array
     slopes: tuple[Array, ...]
     spins: tuple[Array, Array, Array]
+    damping: Array
 
 
 def turned(view: View, rotation: Array) -> View:
@@ -286,10 +288,12 @@ def _residual(
 ) -> Residual:
     """Residual from where a ray meets a surface: ∇F there (of the given length) and the derivatives of F."""
     fall = -_dot(normal, direction)
-    variance = jnp.ones_like(met.depth)
+    variance, damping = jnp.ones_like(met.depth), jnp.ones_like(met.depth)
     if view.ray is not None:
         variance = 1 + SIDEWAYS**2 / ((fall / length) ** 2 + GRAZING**2)
+        steep = jnp.abs(fall)
         fall = jnp.sqrt(fall**2 + (GRAZING * length) ** 2)
+        damping = steep / fall
     gain = view.gain * lax.rsqrt(variance)
     rate = -gain / fall
     x, y, z = hit
@@ -300,6 +304,7 @@ def _residual(
         variance=variance,
         slopes=tuple(column * rate for column in slopes),
         spins=((y * r - z * q) * rate, (z * p - x * r) * rate, (x * q - y * p) * rate),
+        damping=damping,
     )
 
 

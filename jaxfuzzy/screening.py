@@ -11,7 +11,7 @@ from jaxfuzzy.rays import Meeting, View
 # Noise distance in deviations; twice as much is wider than thin objects, and wrong basins win.
 SCREEN = 2.0
 KEPT = 6
-SLOPES, SLOPED = (0.0, 0.3, 0.7), 4
+SLOPES, SLOPED = (0.0, 0.3, 0.7), 2
 
 
 def price(met: Meeting, view: View, threshold: float | Array = SCREEN) -> Array:
