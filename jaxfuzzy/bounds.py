@@ -42,7 +42,13 @@ def stretch(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def ends_of(
-    kind: str, theta: np.ndarray, hits: np.ndarray, part: np.ndarray, on: np.ndarray, detail: np.ndarray
+    kind: str,
+    theta: np.ndarray,
+    hits: np.ndarray,
+    part: np.ndarray,
+    on: np.ndarray,
+    detail: np.ndarray,
+    rotation: np.ndarray,
 ) -> np.ndarray:
     """Ends (low, high, error) (3, 3) of a surface in its own frame, unit free.
 
@@ -53,6 +59,7 @@ def ends_of(
         part: The part of the surface each belongs to.
         on: Which are inliers.
         detail: Signs of a box, ends of a body of revolution.
+        rotation: From the object's frame into the surface's own (3, 3).
     """
     ends = np.zeros((3, 3))
     if kind in ("cylinder", "cone"):
@@ -75,7 +82,7 @@ def ends_of(
             if detail[i]:
                 ends[i, 1 if detail[i] > 0 else 0] = theta[1 + i]
     elif kind == "plane":
-        first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]), np)
+        first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]), rotation, np)
         a, b = hits[on] @ first, hits[on] @ second
         # The rectangle of least area, turned in its plane.
         turns = np.deg2rad(np.arange(0, 90, 3.0))
@@ -129,7 +136,7 @@ def assembled(
         )
     length = jnp.sqrt((theta[:3] ** 2).sum())
     normal = theta[:3] / length
-    first, second = _patch_axes(normal, jnp)
+    first, second = _patch_axes(normal, rotation, jnp)
     c, s = jnp.cos(ends[2, 0]), jnp.sin(ends[2, 0])
     first, second = c * first + s * second, c * second - s * first
     foot = normal * theta[3] / length
@@ -140,11 +147,12 @@ def assembled(
     return Plane(point=corners.mean(0), normal=turn.T @ normal, corners=corners)
 
 
-def _patch_axes(normal: Any, xp: Any) -> tuple[Any, Any]:
-    """Two directions in a plane, by NumPy or traced: the level one, or where the plane is level itself, x; and the one across."""
-    zero = xp.zeros_like(normal[0])
-    level = xp.stack([normal[2], zero, -normal[0]])
-    flat = (level**2).sum() < FLAT
-    level = xp.where(flat, xp.stack([normal[1], -normal[0], zero]), level)
+def _patch_axes(normal: Any, rotation: Any, xp: Any) -> tuple[Any, Any]:
+    """Two directions in a plane, by NumPy or traced: the level one, or where the plane is level itself, x; and the one across.
+
+    Level is meant in the object's frame: how far the search let the surface's own lean says nothing of a plane.
+    """
+    level = xp.cross(rotation[:, 1], normal)
+    level = xp.where((level**2).sum() < FLAT, xp.cross(normal, rotation[:, 2]), level)
     first = level / xp.sqrt((level**2).sum())
     return first, xp.cross(normal, first)

@@ -337,7 +337,13 @@ def _ends(look: Look, seen: Judged) -> np.ndarray:
     hits = (item.points + seen.depth[:, None] * item.rays) @ polished.turn.T
     kind = KINDS[look.fitted.kind]
     return bounds.ends_of(
-        kind, np.asarray(polished.theta), hits, seen.part, _on(look, seen), np.asarray(look.fitted.detail)
+        kind,
+        np.asarray(polished.theta),
+        hits,
+        seen.part,
+        _on(look, seen),
+        np.asarray(look.fitted.detail),
+        np.asarray(polished.turn),
     )
 
 
