@@ -21,6 +21,7 @@ from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.objects import MOST
 from jaxfuzzy.occlusion import with_hidden_ends
+from jaxfuzzy.outline import without_seen_through
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
@@ -252,6 +253,7 @@ def _model(
             members = members_of(parts)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
+            shapes = without_seen_through(points, [own[m] for m in members], shapes, eye, np.asarray(vertical))
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
         if cloud.pixels_px is not None:
             shapes = tuple(_with_correlated_errors(shape) for shape in shapes)
