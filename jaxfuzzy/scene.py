@@ -21,7 +21,7 @@ from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.objects import MOST
 from jaxfuzzy.occlusion import with_hidden_ends
-from jaxfuzzy.outline import without_seen_through
+from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
@@ -242,18 +242,25 @@ def _model(
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         places, eye = points[own], None if camera is None else np.asarray(camera)
         members = members_of(parts)
-        shapes = fit_members(places, members, rule=shape_rule, **seen(own), **picked)
+        sight = None
+        if eye is not None and shape_rule != "paper":
+            loose = np.ones(count, bool)
+            loose[own[np.concatenate([np.zeros(0, int), *members])]] = False
+            sight = sight_of(points, loose, eye, np.asarray(vertical, float))
+
+        def fit(sets: Sequence[np.ndarray], capacity: int = 0) -> tuple[Shape, ...]:
+            found = fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
+            return found if sight is None else without_seen_through(points, [own[m] for m in sets], found, sight)
+
+        shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
-
-            def fit(sets: Sequence[np.ndarray], capacity: int) -> tuple[Shape, ...]:
-                return fit_members(places, sets, rule=shape_rule, capacity=capacity, **seen(own), **picked)
-
             across = np.asarray(tangents(jnp.asarray(vertical)))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
             members = members_of(parts)
+        if sight is not None:
+            shapes = without_seen_through(points, [own[m] for m in members], shapes, sight)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
-            shapes = without_seen_through(points, [own[m] for m in members], shapes, eye, np.asarray(vertical))
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
         if cloud.pixels_px is not None:
             shapes = tuple(_with_correlated_errors(shape) for shape in shapes)

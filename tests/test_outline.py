@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfuzzy.outline import without_seen_through
+from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Sphere
 from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Shape
@@ -77,7 +77,10 @@ def told(body, missing=None, screen=None, unmatched=None, outliers=0):
         status=jnp.asarray(0, jnp.int32),
         kind=body.kind,
     )
-    return shape, without_seen_through(points, [own], [shape], CAMERA, UP)[0]
+    loose = np.ones(len(points), bool)
+    loose[own] = False
+    sight = sight_of(points, loose, CAMERA, UP)
+    return shape, without_seen_through(points, [own], [shape], sight)[0]
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -119,6 +122,12 @@ def test_a_bowl_is_no_whole_sphere_and_a_body_half_there_none():
     before, after = told(sphere, missing=lambda p: p[:, 1] > -0.03)
     assert after is before
     assert told(sphere, missing=lambda p: p[:, 0] > 0)[1].kind == "unknown"
+
+
+def test_what_sticks_out_of_a_vessel_does_not_speak_against_it():
+    """Pencils: the upper half of the cylinder is a narrow stripe."""
+    before, after = told(BODIES["cylinder"], missing=lambda p: (p[:, 1] > 0) & (np.abs(p[:, 0]) > 0.015))
+    assert after is before
 
 
 def test_an_open_vessel_is_seen_into():
