@@ -132,6 +132,8 @@ def _hits(body: Primitive, held: np.ndarray, sight: Sight) -> np.ndarray:
         low, high = np.quantile((held - sight.camera) @ across.T, ENDS, axis=0)
         place = np.where(hit > 0, hit, 0)[:, None] * (sight.rays @ across.T)
         return np.where((hit > 0) & ((place >= low) & (place <= high)).all(axis=1), hit, np.inf)
+    if not _extended(body):
+        return np.full(len(sight.rays), np.inf)
     solid = body_of(body)
     start = np.broadcast_to((sight.camera - solid.origin) @ solid.rotation.T, sight.rays.shape)
     hit, part = solid.cast(start, sight.rays @ solid.rotation.T)
@@ -141,6 +143,18 @@ def _hits(body: Primitive, held: np.ndarray, sight: Sight) -> np.ndarray:
         return np.where(share[part] >= FACE, hit, np.inf)
     # A vessel may be open: of a cylinder or cone the side alone is claimed.
     return hit if isinstance(body, Sphere) else np.where(part == 0, hit, np.inf)
+
+
+def _extended(body: Primitive) -> bool:
+    """Whether a body has an extent in every direction."""
+    match body:
+        case Cylinder():
+            return float(body.height) > 0
+        case Cone():
+            return float(body.height[0]) < float(body.height[1])
+        case Box():
+            return float(np.min(np.asarray(body.size))) > 0
+    return True
 
 
 def _refused(shape: Shape) -> Shape:

@@ -1,5 +1,7 @@
 """What stands behind a body must not be seen through it: bodies cast by hand before a wall, whole and with parts missing."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -107,6 +109,16 @@ def test_a_body_that_is_seen_through_is_refused(name):
     assert after.inliers.shape == before.inliers.shape
     assert int(after.status) == Status.REFUSED | Status.SEEN_THROUGH
     assert after.guards[-1].startswith(f"{name}: ")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_body_without_an_extent_hides_nothing():
+    disc = Cylinder(jnp.array([0, 0, 1.3]), jnp.array([0, 1.0, 0]), jnp.asarray(0.1), jnp.asarray(0.0))
+    points = np.random.default_rng(0).uniform([-0.1, -0.1, 1.2], [0.1, 0.1, 2.0], (500, 3))
+    shape = told(BODIES["cylinder"])[0]
+    shape = dataclasses.replace(shape, primitive=disc, inliers=jnp.ones(500, bool))
+    sight = sight_of(points, np.zeros(500, bool), CAMERA, UP)
+    assert without_seen_through(points, [np.arange(500)], [shape], sight)[0] is shape
 
 
 def test_flat_things_need_not_be_rectangles():
