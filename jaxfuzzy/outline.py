@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.linalg import tangents
-from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric, Sphere
+from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -122,27 +122,46 @@ def _seen_through(body: Primitive, noise_distance: float, held: np.ndarray, mine
 
 def _hits(body: Primitive, held: np.ndarray, sight: Sight) -> np.ndarray:
     """How far along each ray (n,) it meets the part of a surface that its points claim to be there; inf where it does not."""
+    hit = np.full(len(sight.rays), np.inf)
     if isinstance(body, Plane):
-        normal = np.asarray(body.normal, float)
-        with np.errstate(divide="ignore"):
-            hit = ((np.asarray(body.point, float) - sight.camera) @ normal) / (sight.rays @ normal)
-        turns = np.arange(DIRECTIONS)[:, None] * np.pi / DIRECTIONS
-        first, second = np.asarray(tangents(jnp.asarray(normal)), float)
-        across = np.cos(turns) * first + np.sin(turns) * second
-        low, high = np.quantile((held - sight.camera) @ across.T, ENDS, axis=0)
-        place = np.where(hit > 0, hit, 0)[:, None] * (sight.rays @ across.T)
-        return np.where((hit > 0) & ((place >= low) & (place <= high)).all(axis=1), hit, np.inf)
-    if not _extended(body):
-        return np.full(len(sight.rays), np.inf)
-    solid = body_of(body)
-    start = np.broadcast_to((sight.camera - solid.origin) @ solid.rotation.T, sight.rays.shape)
-    hit, part = solid.cast(start, sight.rays @ solid.rotation.T)
-    if isinstance(body, Box):
-        local = np.abs((held - np.asarray(body.center)) @ np.asarray(body.axes).T) / (np.asarray(body.size) / 2)
-        share = np.bincount(local.argmax(axis=1), minlength=3) / len(held)
-        return np.where(share[part] >= FACE, hit, np.inf)
-    # A vessel may be open: of a cylinder or cone the side alone is claimed.
-    return hit if isinstance(body, Sphere) else np.where(part == 0, hit, np.inf)
+        middle = held.mean(axis=0)
+        reach = np.linalg.norm(held - middle, axis=1).max()
+        near = _near(sight, middle, reach)
+        hit[near] = _hits_of_plane(body, held - sight.camera, sight.rays[near], sight.camera)
+    elif _extended(body):
+        solid = body_of(body)
+        near = _near(sight, solid.place(np.array([0.0, solid.height / 2, 0.0])), solid.reach)
+        start = np.broadcast_to((sight.camera - solid.origin) @ solid.rotation.T, (len(near), 3))
+        depth, part = solid.cast(start, sight.rays[near] @ solid.rotation.T)
+        # A vessel may be open: of a cylinder or cone the side alone is claimed.
+        claimed = np.array([True, False, False])
+        if isinstance(body, Box):
+            local = np.abs((held - np.asarray(body.center)) @ np.asarray(body.axes).T) / (np.asarray(body.size) / 2)
+            claimed = np.bincount(local.argmax(axis=1), minlength=3) >= FACE * len(held)
+        hit[near] = np.where(claimed[part], depth, np.inf)
+    return hit
+
+
+def _hits_of_plane(body: Plane, held: np.ndarray, rays: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """The same of a flat patch, which ends where its points do."""
+    normal = np.asarray(body.normal, float)
+    with np.errstate(divide="ignore"):
+        hit = ((np.asarray(body.point, float) - camera) @ normal) / (rays @ normal)
+    turns = np.arange(DIRECTIONS)[:, None] * np.pi / DIRECTIONS
+    first, second = np.asarray(tangents(jnp.asarray(normal)), float)
+    across = np.cos(turns) * first + np.sin(turns) * second
+    low, high = np.quantile(held @ across.T, ENDS, axis=0)
+    place = np.where(hit > 0, hit, 0)[:, None] * (rays @ across.T)
+    return np.where((hit > 0) & ((place >= low) & (place <= high)).all(axis=1), hit, np.inf)
+
+
+def _near(sight: Sight, middle: np.ndarray, reach: float) -> np.ndarray:
+    """Which rays pass within reach of a place; all where the camera is within."""
+    offset = middle - sight.camera
+    away = float(np.linalg.norm(offset))
+    if away <= reach:
+        return np.arange(len(sight.rays))
+    return np.flatnonzero(sight.rays @ (offset / away) >= np.sqrt(1 - (reach / away) ** 2) - 1e-9)
 
 
 def _extended(body: Primitive) -> bool:
