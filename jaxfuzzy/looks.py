@@ -28,7 +28,7 @@ MISFIT_GIVEN = 1.75
 # A surface is refused too where its noise is so many times what was given, or more, and so many times what small windows say: the
 # noise given is then too large for this object, and hides slow waves. Small windows of stereo take part of its noise, which
 # neighbors share, for surface: right ones above the first have up to 1.9 of the last on photographs, rendered and depth-camera
-# tables (a bowl of which every third row is looked at 2.1), on simulated clouds 1.1; a plaster bust has 2.3 to 2.9 by four
+# tables (a bowl of which every third row is looked at 2.1), on simulated clouds 1.1; a plaster bust has 2.3 to 3.4 by five
 # matchers, bowling pins 3.3 to 5.1, boxes fitted to round things 2.9 to 4.8. Flat things may be bent a little (the second).
 ABOVE, ABOVE_FLAT, WAVY = 0.8, 1.15, 2.2
 # Just off a surface: up to so many deviations.
