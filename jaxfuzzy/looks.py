@@ -25,6 +25,12 @@ FEWEST = 12
 MISFIT, SUSPECT, NEAR, BULGE = 1.9, 1.35, 0.06, 0.055
 # The same where the noise was given: real tins, cups and boxes stay below 1.7, a carved mask has 1.86.
 MISFIT_GIVEN = 1.75
+# A surface is refused too where its noise is so many times what was given, or more, and so many times what small windows say: the
+# noise given is then too large for this object, and hides slow waves. Small windows of stereo take part of its noise, which
+# neighbors share, for surface: right ones above the first have up to 1.9 of the last on photographs, rendered and depth-camera
+# tables (a bowl of which every third row is looked at 2.1), on simulated clouds 1.1; a plaster bust has 2.3 to 3.4 by five
+# matchers, bowling pins 3.3 to 5.1, boxes fitted to round things 2.9 to 4.8. Flat things may be bent a little (the second).
+ABOVE, ABOVE_FLAT, WAVY = 0.8, 1.15, 2.2
 # Just off a surface: up to so many deviations.
 FAR = 6.0
 # Share of points between one and 2.4 given noise distances of the surface, less what uniform outliers explain, from which on it is
@@ -191,7 +197,9 @@ def _reason(look: Look) -> Status:
     if look.noise > HOPELESS or on < max(FEWEST / 2, LEAST_SHARE * weight.sum()):
         return Status.ALL_NOISE | Status.REFUSED
     times = float(p.scale) / max(1.0, float(look.fitted.local))
-    if item.given and (times > MISFIT_GIVEN or _beyond(look) > BEYOND):
+    least = ABOVE_FLAT if KINDS[look.fitted.kind] == "plane" else ABOVE
+    wavy = p.scale > max(least, WAVY * float(look.fitted.local))
+    if item.given and (times > MISFIT_GIVEN or wavy or _beyond(look) > BEYOND):
         return Status.REFUSED | look.scattered
     near = weight @ ((distance > DEVIATIONS) & (distance < FAR)) / (weight @ (distance < FAR))
     suspect = look.misfit > SUSPECT and near > NEAR and look.noise > BULGE

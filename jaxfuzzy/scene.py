@@ -21,6 +21,7 @@ from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.objects import OF_SCENE
 from jaxfuzzy.occlusion import with_hidden_ends
+from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
@@ -241,15 +242,23 @@ def _model(
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         places, eye = points[own], None if camera is None else np.asarray(camera)
         members = members_of(parts)
+        sight = None
+        if eye is not None and shape_rule != "paper":
+            loose = np.ones(count, bool)
+            loose[own[np.concatenate([np.zeros(0, int), *members])]] = False
+            sight = sight_of(points, loose, eye, np.asarray(vertical, float))
 
         def fit(sets: Sequence[np.ndarray]) -> tuple[Shape, ...]:
-            return fit_members(places, sets, rule=shape_rule, capacity=OF_SCENE, **seen(own), **picked)
+            found = fit_members(places, sets, rule=shape_rule, capacity=OF_SCENE, **seen(own), **picked)
+            return found if sight is None else without_seen_through(points, [own[m] for m in sets], found, sight)
 
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
             across = np.asarray(tangents(jnp.asarray(vertical)))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
             members = members_of(parts)
+        if sight is not None:
+            shapes = without_seen_through(points, [own[m] for m in members], shapes, sight)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)

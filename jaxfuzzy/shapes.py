@@ -236,6 +236,8 @@ def with_quadrics(
 ) -> tuple[Shape, ...]:
     """Names "quadric" what is refused as every kind but lies on a general quadric; its status stays REFUSED.
 
+    What is refused since things are seen through it lies on some surface, and is none all the same.
+
     Args:
         points: Points (N, 3) in metres.
         members: Indices of the points of each shape.
@@ -245,7 +247,7 @@ def with_quadrics(
     weight = np.ones(len(points)) if weights is None else np.asarray(weights, float)
     told = []
     for own, shape in zip(members, shapes, strict=True):
-        refused = int(shape.status) & (Status.REFUSED | Status.ALL_NOISE) == Status.REFUSED
+        refused = int(shape.status) & (Status.REFUSED | Status.ALL_NOISE | Status.SEEN_THROUGH) == Status.REFUSED
         found = None
         if shape.primitive is None and refused:
             found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))

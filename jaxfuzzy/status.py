@@ -40,6 +40,7 @@ class Status(enum.IntFlag):
     STALLED = 1 << 25
     RAN_AWAY = 1 << 26
     SCATTERED = 1 << 27
+    SEEN_THROUGH = 1 << 28
 
 
 SENTENCES: dict[Status, str] = {
@@ -78,6 +79,8 @@ SENTENCES: dict[Status, str] = {
     " bound the value, or use another loss.",
     Status.SCATTERED: "Points scatter more than twice as much as noise_distance says, even within small windows: raise it if it is"
     " too small.",
+    Status.SEEN_THROUGH: "The best surface would hide things that are seen behind it: the object has another outline, or holes, or"
+    " is several; see the guards for the kind.",
 }
 
 

@@ -119,6 +119,22 @@ def test_wrong_surfaces_are_told_by_the_points_just_off_them():
     assert all(shape.kind == "unknown" and shape.status & Status.SCATTERED for shape in few)
 
 
+def test_slow_waves_are_told_from_noise_that_was_given_too_large():
+    """Waves of 15 cm in bodies of 20 cm: no more than half as much again as the noise given, but small windows know of none."""
+    kinds = ("plane", "cylinder", "cone", "sphere")
+    made = {"depth_std": 0.0005, "radius": (0.1, 0.1), "points": (1600, 1600)}
+    flat = [simulate_object(kind, 900, **made) for kind in kinds]
+    points, labels, _ = together(flat)
+    wave = np.sin(2 * np.pi * points[:, 0] / 0.15 + 1) * np.sin(2 * np.pi * points[:, 1] / 0.15)
+    wavy = points * (1 + 0.009 * wave / np.linalg.norm(points, axis=1))[:, None]
+    both = np.concatenate([points, wavy]), np.concatenate([labels, labels + len(kinds)])
+    shapes = fit_shapes(*both, camera=CAMERA, noise_distance=SIGMAS * 0.003)
+    assert [shape.kind for shape in shapes[: len(kinds)]] == list(kinds)
+    for shape in shapes[len(kinds) :]:
+        assert shape.kind in ("unknown", "quadric")
+        assert int(shape.status) & Status.REFUSED
+
+
 def test_bad_objects_are_told_alone_and_in_a_batch(batch):
     for (points, status), inside in zip(bad_objects().values(), batch[-4:], strict=True):
         alone = fit_shape(points, camera=CAMERA, noise_distance=SIGMAS * 0.001)

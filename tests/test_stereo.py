@@ -16,7 +16,7 @@ from jaxfuzzy.photos import alignment, read_disparity, read_pair, rectify
 from jaxfuzzy.primitives import Sphere
 from jaxfuzzy.render import Setting, paper_scene, render_pair, table_scene
 from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity, measure_noise
-from jaxfuzzy.rig import Rig
+from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.status import Status
 from jaxfuzzy.stereo import disparity, example_pair, reconstruct, search_range
 
@@ -249,7 +249,7 @@ def test_fractions_are_neither_truncated_nor_on_a_grid(table, matched):
     wall = valid & (table.depth_m == np.float32(1.8))
     assert np.all(rough[wall] * 16 % 1 == 0)
     assert abs(np.median(rough[wall]) - 31.1111) > 0.04
-    assert abs(np.median(values[wall]) - 31.1111) < 0.01
+    assert abs(np.median(values[wall]) - 31.1111) < 0.015
     objects = valid & (table.labels >= 0)
     deviation = {
         name: np.median(np.abs(map_ - table.disparity_px)[objects])
@@ -620,6 +620,22 @@ def test_the_bundled_pair_is_middleburys_and_comes_out_metric(shared_data):
     # Disparities of 12 to 55 px, an offset of 52 px.
     near, far = np.percentile(np.asarray(cloud.points)[:, 2], [1, 99])
     assert 1.1 < near < far < 1.9
+
+
+def test_a_ball_is_not_flattened(shared_data):
+    """The price of a one-pixel step holds slanted sides flat: at 8 the radius comes out 3.1 % too large, at 5 1.3 %."""
+    folder = shared_data / "middlebury2006_bowling1_half"
+    rig, truth = load_rig(folder / "calib.txt"), read_disparity(folder / "disp1.png", scale=2)
+    values, valid = map(np.asarray, disparity(folder / "view1.png", folder / "view5.png", rig))
+    rows, columns = np.indices(truth.shape)
+    ball = (np.hypot(columns - 270, rows - 225) < 140) & valid & (np.abs(values - truth) < 1.5)
+    radii = []
+    for seen in (values, truth):
+        p = np.asarray(cloud_from_disparity(np.where(ball, seen, np.nan), ball, rig).points, float)
+        solved = np.linalg.lstsq(np.column_stack([2 * p, np.ones(len(p))]), (p * p).sum(axis=1), rcond=None)[0]
+        radii.append(np.sqrt(solved[3] + solved[:3] @ solved[:3]))
+    assert ball.sum() > 55_000
+    assert radii[0] / radii[1] == pytest.approx(1, abs=0.02)
 
 
 def test_the_bundled_pair_against_ground_truth(shared_data):
