@@ -25,7 +25,7 @@ THROUGH = 0.25
 # Behind means by more than so many noise distances.
 CLEARLY = 4.0
 # A fair share of all points is looked at: so many, and less than twice as many; fewer on a surface than these say nothing.
-LOOKED_AT, FEWEST = 65_536, 50
+LOOKED_AT, FEWEST = 32_768, 50
 # A solid is looked at in so many slices across its axis with as many of its points each, and the worst ones do not count: pencils
 # in a mug make the cylinder twice as high as it is, and of the right kind and radius all the same.
 SLICES, WORST = 10, 2
