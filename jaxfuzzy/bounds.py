@@ -127,9 +127,14 @@ def assembled(
         face = theta[1:4]
         low = jnp.where(signs < 0, face, low)[jnp.array([0, 2, 1])]
         high = jnp.where(signs > 0, face, high)[jnp.array([0, 2, 1])]
+        center, size = place(axes.T @ (0.5 * (low + high))), high - low
+        # The search may find a box by either of its upright faces first: the longer edge comes first.
+        longer = size[2] > size[0]
+        size = jnp.where(longer, size[::-1], size)
+        axes = jnp.where(longer, jnp.stack([axes[2], axes[1], -axes[0]]), axes)
         return Box(
-            center=place(axes.T @ (0.5 * (low + high))),
-            size=frame.unit * (high - low),
+            center=center,
+            size=frame.unit * size,
             axes=axes @ turn,
             # A box has two faces at least, and each edge lies along one of them; what may hide its end is not known here.
             seen=jnp.ones(3, bool),
