@@ -91,13 +91,13 @@ def _ended(
     straight = theta[:, 3] == 0
     lidded = vessels_of(theta, rays.CLOSED * jnp.ones_like(theta[:, 4]), theta[:, 4], ~straight)
 
-    tried_all, n = joined([rimmed, lidded]), len(many)
-    threshold = jnp.where(jnp.arange(len(tried_all.theta)) < n, SCREEN, 2 * SCREEN)[:, None]
-    cost = price(rays.meet_revolution(tried_all.theta, tried_all.detail, few), few, threshold)
+    every, n = joined([rimmed, lidded]), len(many)
+    threshold = jnp.where(jnp.arange(len(every.theta)) < n, SCREEN, 2 * SCREEN)[:, None]
+    cost = price(rays.meet_revolution(every.theta, every.detail, few), few, threshold)
     rim = jnp.argmin(cost[:n].reshape(-1, len(height)), -1) + jnp.arange(n // len(height)) * len(height)
     below = cost[n:] + absurd(theta[:, 2])
     pair = jnp.stack([jnp.argmin(jnp.where(kept, below, jnp.inf)) for kept in (straight, ~straight)])
-    return tried_all.take(jnp.concatenate([rim, n + pair]))
+    return every.take(jnp.concatenate([rim, n + pair]))
 
 
 def _bowls(sphere: Array, few: View, window: starts.Windows, height: Array) -> Candidates:

@@ -3,7 +3,8 @@
 The axis is free to lean, with a prior of ten degrees, so that an upright frame known to a few degrees does no harm. Weights
 are the probabilities of belonging to the surface; they fall off for good points too, which the plain inverse normal matrix
 does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Ĵᵀ (Huber, Robust Statistics, 1981), J
-the derivatives that steps take and Ĵ the true ones: along a ray that grazes the surface the former are damped.
+the derivatives that steps take and Ĵ the true ones: along a ray that grazes the surface the former are damped. In ψ² a residual
+counts as if its point had not pulled the surface towards itself (HC3; MacKinnon and White, J. Econometrics 29, 1985).
 """
 
 from collections.abc import Callable
@@ -64,6 +65,8 @@ class _Look(NamedTuple):
 
 
 class _State(NamedTuple):
+    """Where the surface is; `look` is at where it was a step before, `last` says that it rests, `done` that it was seen there."""
+
     step: Array
     theta: Array
     turn: Array
@@ -141,7 +144,7 @@ def polish(
         moved = jnp.where(still, state.moved, jnp.maximum(jnp.abs(move).max(), 0.01 * noise))
         theta, turn = theta + move[:5], starts.rotation(move[5], move[6]) @ turn
         met = met_by(family, theta, turn, candidate.detail, view)
-        last = (moved <= tolerance) | (state.step >= MOST_STEPS)
+        last = ~(moved > tolerance) | (state.step >= MOST_STEPS)
         return _State(state.step + 1, theta, turn, to_scale, to_background, met, seen, moved, last, state.last)
 
     blank, no = jnp.zeros_like(view.gain), jnp.asarray(False)
@@ -156,7 +159,6 @@ def polish(
     # Steps take derivatives damped at grazing incidence; how residuals really change is the undamped ones.
     bend = bend / jnp.maximum(seen.damping, LEAST_DAMPING)
     inverse = starts.invert(normal(end.theta, seen.rows, bend, end.scale), jnp.eye(7, dtype=dtype))
-    # Points far out on a surface pull it towards themselves, and by that much their residuals are too small.
     leverage = seen.own / end.scale**2 * (seen.rows * (inverse @ seen.rows)).sum(0)
     pull = seen.own * seen.error / end.scale / (1 - jnp.clip(leverage, 0.0, MOST_LEVERAGE))
     meat = (seen.rows * pull**2) @ seen.rows.T / end.scale**2

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfuzzy import looks
+from jaxfuzzy import bounds, looks, starts
+from jaxfuzzy.objects import Frame
 from jaxfuzzy.shapes import fit_members, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
 from jaxfuzzy.status import Status
@@ -86,6 +87,40 @@ def test_sizes_are_right(clouds, batch):
         else:
             aligned = np.abs(np.asarray(got.axes) @ np.asarray(truth.axes).T)
             assert aligned.max(0).min() > np.cos(np.deg2rad(0.5))
+
+
+def test_edges_of_a_patch_do_not_hang_on_how_its_frame_leans():
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(-1, 1, (2, 500))
+    normal = np.array([0.4, 0.3, -0.87]) / np.linalg.norm([0.4, 0.3, -0.87])
+    first, second = np.linalg.svd(normal[None])[2][1:]
+    hits, on = u[:, None] * first + 0.6 * v[:, None] * second, np.ones(500, bool)
+    straight, leaning = np.eye(3), np.asarray(starts.rotation(jnp.asarray(0.05), jnp.asarray(-0.03)))
+    found = [
+        bounds.ends_of("plane", np.append(turn @ normal, (0, 0)), hits @ turn.T, 0 * u, on, np.zeros(3), turn)
+        for turn in (straight, leaning)
+    ]
+    # A lean of three degrees moved edges by 0.4 % where the patch was laid level in the leaning frame.
+    np.testing.assert_allclose(*found, atol=1e-6)
+
+
+def test_the_longer_upright_edge_of_a_box_comes_first():
+    """By whichever face it was found, so that no rounding changes the order."""
+    frame, still = Frame(jnp.eye(3), jnp.zeros(3), jnp.asarray(1.0)), jnp.zeros(2)
+    # Ends along x, along z, upwards; a quarter turn describes the same box.
+    ends = {0.3: [[-1, 1, 0], [-2, 2, 0], [0, 3, 0]], 0.3 + np.pi / 2: [[-2, 2, 0], [-1, 1, 0], [0, 3, 0]]}
+    one, other = (
+        bounds.assembled(
+            "box", jnp.array([yaw, 0, 0, 0, 0]), still, jnp.array(e, float), jnp.zeros(3), jnp.eye(3), frame
+        )
+        for yaw, e in ends.items()
+    )
+    np.testing.assert_allclose(one.size, [4, 3, 2])
+    np.testing.assert_allclose(other.size, one.size)
+    np.testing.assert_allclose(other.center, one.center, atol=1e-6)
+    # The same directions, each one way or the other, and right-handed.
+    np.testing.assert_allclose(np.abs(other.axes @ one.axes.T), np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(one.axes), 1, rtol=1e-6)
 
 
 def test_a_flat_face_may_be_a_box(clouds, batch):
