@@ -13,6 +13,8 @@ from jaxfuzzy.solve import Solver
 from jaxfuzzy.status import Status
 from jaxfuzzy.validity import choose_k, fuzzy_silhouette, partition_coefficient, variance_ratio, xie_beni
 
+pytestmark = pytest.mark.usefixtures("compiled_for_one_run")
+
 
 def lumps(k=3, seed=0, counts=(60, 90, 40, 50)):
     rng = np.random.default_rng(seed)

@@ -11,6 +11,7 @@ from jaxfuzzy.solve import Solver
 from jaxfuzzy.status import Status
 from jaxfuzzy.varieties import nfcv
 
+pytestmark = pytest.mark.usefixtures("compiled_for_one_run")
 EPS = np.finfo(float).eps
 ONCE = Solver(max_steps=1, tol=0.0, acceleration=None)
 TIGHT = Solver(max_steps=2000, tol=1e-14)
