@@ -185,3 +185,18 @@ def empty_scene():
     fuzzy = dataclasses.replace(plain.segmentation.partition, memberships=jnp.zeros((count, 0)), sizes=jnp.zeros(0))
     none = dataclasses.replace(plain.segmentation, labels=jnp.full(count, -1), k=0, partition=fuzzy)
     return dataclasses.replace(plain, segmentation=none, shapes=(), timings={})
+
+
+def fitted_shape(body, inliers, noise_distance):
+    """A shape as a fit would give it; unknown without a body."""
+    return Shape(
+        primitive=body,
+        inliers=jnp.asarray(inliers),
+        noise_distance=jnp.asarray(noise_distance),
+        scores={},
+        margin=0.0,
+        counts={},
+        covariance=jnp.zeros((0, 0)),
+        status=jnp.asarray(0, jnp.int32),
+        kind="unknown" if body is None else body.kind,
+    )

@@ -6,8 +6,7 @@ import numpy as np
 from jaxfuzzy.groups import by_shapes
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
-from jaxfuzzy.shapes import Shape
-from jaxfuzzy.status import Status
+from synthetic import fitted_shape
 
 ACROSS = np.array([[1.0, 0, 0], [0, 0, 1.0]])
 
@@ -21,17 +20,7 @@ def shape_of(points, body, noise=0.005):
     """A shape as a fit would give it; unknown where the body holds less than half of the points."""
     held = np.asarray(body.distance(points)) < noise
     good = held.mean() > 0.49
-    return Shape(
-        primitive=body if good else None,
-        inliers=jnp.asarray(held & good),
-        noise_distance=jnp.asarray(noise),
-        scores={},
-        margin=0.0,
-        counts={},
-        covariance=jnp.zeros((4, 4)),
-        status=jnp.asarray(int(Status(0)), jnp.int32),
-        kind=body.kind if good else "unknown",
-    )
+    return fitted_shape(body if good else None, held & good, noise)
 
 
 def fitted_to(points, bodies):

@@ -12,9 +12,10 @@ from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.occlusion import ends_of, with_hidden_ends
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Sphere
 from jaxfuzzy.scene import model_cloud
-from jaxfuzzy.shapes import Shape, fit_shapes
+from jaxfuzzy.shapes import fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object, simulate_scene
 from jaxfuzzy.status import Status
+from synthetic import fitted_shape
 
 CAMERA = np.zeros(3)
 TURN = np.deg2rad(30)
@@ -43,17 +44,7 @@ def seen(body, count=1500, seed=0):
 
 def shape(body, count):
     """What a fit would say if all its points were on it."""
-    return Shape(
-        primitive=body,
-        inliers=jnp.ones(count, bool),
-        noise_distance=jnp.asarray(0.002),
-        scores={},
-        margin=0.0,
-        counts={},
-        covariance=jnp.zeros((0, 0)),
-        status=jnp.asarray(0, jnp.int32),
-        kind=body.kind,
-    )
+    return fitted_shape(body, np.ones(count, bool), 0.002)
 
 
 def told(*bodies, loose=(), ground=None, thickness=0.0):

@@ -9,8 +9,8 @@ import pytest
 from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Sphere
 from jaxfuzzy.render import body_of
-from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
+from synthetic import fitted_shape
 
 CAMERA, UP = np.zeros(3), np.array([0.0, 1.0, 0.0])
 TURN = np.deg2rad(30)
@@ -68,17 +68,7 @@ def told(body, missing=None, screen=None, unmatched=None, outliers=0):
     stray = rng.uniform([-0.4, -0.4, 0.7], [0.4, 0.4, 1.7], (outliers, 3))
     points = np.concatenate([(depth[:, None] * ray)[kept], stray])
     own = np.flatnonzero(there[kept])
-    shape = Shape(
-        primitive=body,
-        inliers=jnp.ones(len(own), bool),
-        noise_distance=jnp.asarray(0.005),
-        scores={},
-        margin=0.0,
-        counts={},
-        covariance=jnp.zeros((0, 0)),
-        status=jnp.asarray(0, jnp.int32),
-        kind=body.kind,
-    )
+    shape = fitted_shape(body, np.ones(len(own), bool), 0.005)
     loose = np.ones(len(points), bool)
     loose[own] = False
     sight = sight_of(points, loose, CAMERA, UP)
