@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -145,7 +146,6 @@ class Seen(NamedTuple):
 class _State(NamedTuple):
     candidates: Candidates
     turns: Array | None
-    met: Meeting
     seen: Seen
     cost: Array
 
@@ -173,16 +173,22 @@ def descend(
     Returns:
         Candidates, their rotations, and in the end the objective of each and how it explains the points.
     """
-    # Two looks more than steps: at the first nothing is known yet of where rays meet surfaces, the last is at what was found;
-    # at neither does anything move. A compiler works out twice what stands in a program twice.
-    steps = jnp.asarray((thresholds[0], *thresholds, thresholds[-1]), candidates.theta.dtype)
+    # One look more than steps: the last is at what was found, and nothing moves.
+    steps = jnp.asarray((*thresholds, thresholds[-1]), candidates.theta.dtype)
     size = 5 if turns is None else 7
-    see = lambda turns: view if turns is None else rays.turned(view, turns)
+
+    def met_by(now: Candidates, turns: Array | None) -> tuple[View, Meeting]:
+        seen = view if turns is None else rays.turned(view, turns)
+        return seen, meet(now, counts, seen, lids)
+
+    def nothing(now: Candidates, turns: Array | None) -> tuple[View, Meeting]:
+        return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(met_by, now, turns))
 
     def step(i: int, state: _State) -> _State:
-        now, turns, met, *_ = state
-        # Where rays meet surfaces is carried from step to step, else the compiler works it out once for every derivative.
-        r = look(now, counts, see(turns), met)
+        now, turns, *_ = state
+        # A branch that is always taken: without it the compiler works out anew for every derivative where rays meet surfaces.
+        own, met = lax.cond(i >= 0, met_by, nothing, now, turns)
+        r = look(now, counts, own, met)
         seen = Seen(r.error**2 + r.miss**2, r.variance, met.part)
         square = seen.square / steps[i] ** 2
         u = 1 / (1 + square)
@@ -190,14 +196,13 @@ def descend(
         columns = [*r.slopes, r.error] if turns is None else [*r.slopes, r.spins[0], r.spins[2], r.error]
         rows = jnp.stack(columns, 1) * (jnp.sqrt(view.mask) * u)[:, None]
         move = _move(jnp.einsum("hin,hjn->hij", rows, rows), now.free[:, :size])
-        move = jnp.where((i > 0) & (i <= len(thresholds)), jnp.clip(move, -largest, largest), 0.0)
+        move = jnp.where(i < len(thresholds), jnp.clip(move, -largest, largest), 0.0)
         now = now._replace(theta=now.theta + move[:, :5])
         turns = None if turns is None else starts.rotation(move[:, 5], move[:, 6]) @ turns
-        return _State(now, turns, meet(now, counts, see(turns), lids), seen, cost)
+        return _State(now, turns, seen, cost)
 
     blank = jnp.zeros((len(candidates.theta), len(view.gain)), candidates.theta.dtype)
-    nowhere = Meeting(blank, blank, blank.astype(jnp.int32))
-    start = _State(candidates, turns, nowhere, Seen(blank, blank, nowhere.part), jnp.zeros_like(blank[:, 0]))
+    start = _State(candidates, turns, Seen(blank, blank, blank.astype(jnp.int32)), jnp.zeros_like(blank[:, 0]))
     end = lax.fori_loop(0, len(steps), step, start)
     return end.candidates, end.turns, end.cost, end.seen
 

@@ -44,7 +44,8 @@ class Fitted(NamedTuple):
     polished: polish.Polished
 
 
-@partial(jax.jit, static_argnames="along_ray")
+# Processors that have wide vectors are a tenth faster with them; the compiler takes halves by default.
+@partial(jax.jit, static_argnames="along_ray", compiler_options={"xla_cpu_prefer_vector_width": 512})
 def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: bool) -> Fitted:
     """Fits all objects of a padded batch, one after the other; padding costs nothing.
 

@@ -70,9 +70,8 @@ def patches(view: View, anchor: Array) -> Patches:
     terms = jnp.stack([jnp.ones_like(s), s, t, s * s, s * t, t * t, h], 1)
     start = jnp.sqrt((window * h**2).sum(-1) / total) + 1e-6
 
-    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        scale, coefficients = state
-        error = jnp.einsum("wcn,wc->wn", terms, coefficients)
+    def step(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        scale, error = state[0], state[2]
         # A noise cluster at 2.5 deviations, m = 2.
         weight = window / (1 + error**2 / (6.25 * scale**2)[:, None]) ** 2
         moment = jnp.einsum("wcn,wdn->wcd", terms * weight[:, None], terms)
@@ -81,10 +80,10 @@ def patches(view: View, anchor: Array) -> Patches:
         coefficients = jnp.concatenate([-solved, jnp.ones_like(solved[:, :1])], -1)
         error = jnp.einsum("wcn,wc->wn", terms, coefficients)
         ratio = (window * error**2 / (error**2 + scale[:, None] ** 2 + 1e-20)).sum(-1) / total
-        return jnp.maximum(scale * (ratio / NORMAL_MEAN) ** 0.8, 1e-7), coefficients
+        return jnp.maximum(scale * (ratio / NORMAL_MEAN) ** 0.8, 1e-7), coefficients, error
 
-    zero = jnp.concatenate([jnp.zeros((len(anchor), 6), point.dtype), jnp.ones((len(anchor), 1), point.dtype)], -1)
-    scale, coefficients = lax.fori_loop(0, STEPS, step, (start, zero))
+    blank = jnp.zeros((len(anchor), 7), point.dtype)
+    scale, coefficients, _ = lax.fori_loop(0, STEPS, step, (start, blank, h))
     slope1, slope2 = coefficients[:, 1], coefficients[:, 2]
     outward = normal + slope1[:, None] * first + slope2[:, None] * second
     outward = outward * lax.rsqrt((outward**2).sum(-1, keepdims=True))

@@ -83,7 +83,7 @@ class Look(NamedTuple):
     @property
     def noise(self) -> float:
         """Noise of the surface found, in the object's unit."""
-        return float(self.fitted.polished.scale * self.fitted.deviation * np.median(1 / self.item.gain))
+        return float(self.fitted.polished.scale * self.fitted.deviation * self.item.typical)
 
     @property
     def misfit(self) -> float:
@@ -147,14 +147,14 @@ def compiling_ahead(capacity: int, dtype: Any, along_ray: bool) -> Iterator[None
         dtype: Their type.
         along_ray: Whether residuals will be along the viewing ray.
     """
-    with _threads(1) as pool:
+    with threads(1) as pool:
         nothing = stacked((), capacity, dtype)
         # What fails here fails again, aloud, in the search itself.
         pool.submit(fit_batch, nothing, np.ones(len(KINDS), bool), np.asarray(False), along_ray)
         yield
 
 
-def _threads(count: int) -> ThreadPoolExecutor:
+def threads(count: int) -> ThreadPoolExecutor:
     """Threads that compute in the precision this one does: `with jax.enable_x64()` holds for the thread that says so alone."""
     double = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
@@ -169,21 +169,20 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
         return []
     allowed = np.array([k in settings.kinds for k in KINDS])
 
-    def fit(batch: Sequence[Prepared]) -> list[Fitted]:
-        padded = stacked(batch, settings.capacity, settings.dtype)
+    def fit(batch: Sequence[int]) -> list[Look]:
+        padded = stacked([items[i] for i in batch], settings.capacity, settings.dtype)
         fitted = jax.device_get(fit_batch(padded, allowed, np.asarray(settings.gric), settings.along_ray))
-        return [jax.tree.map(lambda a, i=i: a[i], fitted) for i in range(len(batch))]
+        return [look(i, jax.tree.map(lambda a, j=j: a[j], fitted)) for j, i in enumerate(batch)]
+
+    def look(i: int, fitted: Fitted) -> Look:
+        noise = expected[i] if expected else max(1.0, float(fitted.local)) * float(fitted.deviation) * items[i].typical
+        unread = Look(items[i], fitted, noise, Status(0))
+        return unread._replace(reason=_reason(unread))
 
     # Batches of one compiled size, side by side on the processors there are; two each, since some take longer than others.
     workers = os.cpu_count() or 1
-    with _threads(workers) as pool:
-        found = [f for batch in pool.map(fit, batches(items, 2 * workers)) for f in batch]
-    looks = []
-    for i, (item, fitted) in enumerate(zip(items, found, strict=True)):
-        noise = max(1.0, float(fitted.local)) * fitted.deviation * np.median(1 / item.gain)
-        look = Look(item, fitted, expected[i] if expected else float(noise), Status(0))
-        looks.append(look._replace(reason=_reason(look)))
-    return looks
+    with threads(workers) as pool:
+        return [look for batch in pool.map(fit, batches(range(len(items)), 2 * workers)) for look in batch]
 
 
 def _reason(look: Look) -> Status:
@@ -212,13 +211,14 @@ def _beyond(look: Look) -> float:
     weight, distance = item.weight[: look.fitted_to], np.sqrt(p.square[: look.fitted_to])
     on = weight @ (distance <= DEVIATIONS)
     near = weight @ ((distance > DEVIATIONS) & (distance < FAR))
-    stray = p.background * weight.sum() * 2 * (FAR - DEVIATIONS) / (item.depth_range * np.median(item.gain))
+    stray = p.background * weight.sum() * 2 * (FAR - DEVIATIONS) * item.typical / item.depth_range
     return float((near - stray) / max(near + on, 1e-12))
 
 
 def _with_noise_found(look: Look) -> Prepared:
     item, found = look.item, look.fitted
-    return item._replace(gain=item.gain / (found.deviation * found.polished.scale), given=True)
+    times = float(found.deviation * found.polished.scale)
+    return item._replace(gain=item.gain / times, typical=item.typical * times, given=True)
 
 
 def _turned(look: Look, settings: Settings) -> list[Prepared]:

@@ -19,7 +19,7 @@ CAPACITIES = (2048, 8192)
 # alike, to fewer, so that all scenes share one program.
 MOST = CAPACITIES[-1]
 OF_SCENE = CAPACITIES[0]
-BATCH = 16
+BATCH = 8
 GOLDEN = 0.6180339887498949
 # Height, and a trace of place for points of one height.
 TO_HEIGHT = np.array([1e-7, 1.0, 1.7e-7])
@@ -41,6 +41,7 @@ class Prepared(NamedTuple):
         rays: Unit direction of the viewing ray of each; zeros without a camera (N, 3).
         order: Which of the object's points each is (N,).
         gain: One over the deviation of each, in its own unit; right but for a common factor where not `given` (N,).
+        typical: The median deviation.
         weight: Weight of each (N,).
         eye: Where the camera is; zeros without.
         depth_range: Range of depth over which outliers are spread.
@@ -53,6 +54,7 @@ class Prepared(NamedTuple):
     rays: np.ndarray
     order: np.ndarray
     gain: np.ndarray
+    typical: float
     weight: np.ndarray
     eye: np.ndarray
     depth_range: float
@@ -106,6 +108,7 @@ def prepared(
         rays=ray[order],
         order=order,
         gain=gain[order],
+        typical=float(np.median(1 / gain)),
         weight=weight[order],
         eye=eye,
         depth_range=max(float(np.ptp(depth)), 1e-6),
@@ -144,11 +147,13 @@ def with_more(
         ray = q - item.eye
         ray = ray / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)[:, None]
     join = lambda a, b: np.concatenate([a, b])
+    gain = join(item.gain, unit / deviation)
     return item._replace(
         points=join(item.points, q),
         rays=join(item.rays, ray),
         order=join(item.order, order),
-        gain=join(item.gain, unit / deviation),
+        gain=gain,
+        typical=float(np.median(1 / gain)),
         weight=join(item.weight, weight),
     )
 

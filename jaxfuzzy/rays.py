@@ -80,10 +80,10 @@ class Residual(NamedTuple):
 
 
 def turned(view: View, rotation: Array) -> View:
-    """The view in the frame of each hypothesis, `rotation` (H, 3, 3) applied to points, rays and camera."""
+    """A view in one frame in that of each hypothesis: `rotation` (H, 3, 3) applied to points, rays and camera."""
 
     def turn(v: Array) -> Array:
-        return jnp.einsum("hij,hj...->hi...", rotation, jnp.broadcast_to(v, (len(rotation), *v.shape[1:])))
+        return jnp.einsum("hij,j...->hi...", rotation, v[0])
 
     ray, eye = (None if v is None else turn(v) for v in (view.ray, view.eye))
     return view._replace(point=turn(view.point), ray=ray, eye=eye)

@@ -5,6 +5,7 @@ known: stereo errs along the ray alone, so a surface should predict one depth a 
 """
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ import numpy as np
 from jaxfuzzy import bounds, checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
 from jaxfuzzy.fitting import TOLERANCES, Fitted, Judged, assemble_batch, judged
-from jaxfuzzy.looks import Look, Settings, look_at, unfit
+from jaxfuzzy.looks import Look, Settings, look_at, threads, unfit
 from jaxfuzzy.mostpoints import most_points
 from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
@@ -312,11 +313,16 @@ def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settin
     """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
     good = {i: look for i, look in looks.items() if not look.reason}
     seen = {i: judged(look.item, look.fitted, settings.along_ray) for i, look in good.items()}
+    same = {kind: [i for i, o in good.items() if KINDS[o.fitted.kind] == kind] for kind in KINDS}
+    parts = [(kind, part) for kind, own in same.items() for part in batches(own)]
+    surfaces = [(kind, *_surfaces([good[i] for i in part], [seen[i] for i in part], settings)) for kind, part in parts]
     made: dict[int, tuple[Primitive, np.ndarray]] = {}
-    for kind in KINDS:
-        same = {i: o for i, o in good.items() if KINDS[o.fitted.kind] == kind}
-        for part in batches(list(same)):
-            made |= _assembled(kind, {i: same[i] for i in part}, seen, settings.dtype)
+    # Side by side for the sake of the first call, which compiles every kind.
+    with threads(os.cpu_count() or 1) as pool:
+        for (_, part), found in zip(
+            parts, pool.map(lambda s: jax.device_get(assemble_batch(*s)), surfaces), strict=True
+        ):
+            made |= {i: jax.tree.map(lambda a, j=j: a[j], found) for j, i in enumerate(part)}
     arrays, rest = [], []
     for i, size in enumerate(sizes):
         if i in made:
@@ -349,20 +355,15 @@ def _ends(look: Look, seen: Judged) -> np.ndarray:
     )
 
 
-def _assembled(
-    kind: str, looks: dict[int, Look], seen: dict[int, Judged], dtype: Any
-) -> dict[int, tuple[Primitive, np.ndarray]]:
-    """Primitives of one kind and their covariances, padded by repetition to one compiled size."""
-    chosen = list(looks)
-    rows = chosen + [chosen[0]] * (BATCH - len(chosen))
-    ends = {i: _ends(look, seen[i]) for i, look in looks.items()}
-    stack = lambda of: np.stack([np.asarray(of(i), dtype) for i in rows])
+def _surfaces(looks: list[Look], seen: list[Judged], settings: Settings) -> tuple[Any, ...]:
+    """What primitives of one kind are made of, padded by repetition to one compiled size."""
+    ends = [_ends(look, judgement) for look, judgement in zip(looks, seen, strict=True)]
+    rows = [*range(len(looks)), *[0] * (BATCH - len(looks))]
+    stack = lambda of: np.stack([np.asarray(of(i), settings.dtype) for i in rows])
     frame = Frame(*(stack(lambda i, f=f: getattr(looks[i].item.frame, f)) for f in Frame._fields))
     polished = lambda name: stack(lambda i: getattr(looks[i].fitted.polished, name))
     detail = stack(lambda i: looks[i].fitted.detail)
-    surface = (polished("theta"), polished("covariance"), polished("turn"), detail, stack(lambda i: ends[i]), frame)
-    primitives, covariances = jax.device_get(assemble_batch(kind, *surface))
-    return {i: (jax.tree.map(lambda a, j=j: a[j], primitives), covariances[j]) for j, i in enumerate(chosen)}
+    return polished("theta"), polished("covariance"), polished("turn"), detail, stack(lambda i: ends[i]), frame
 
 
 def _named(
@@ -380,7 +381,7 @@ def _named(
     if fitted.polished.moved > TOLERANCES[np.dtype(settings.dtype)]:
         status |= Status.NOT_CONVERGED
     scale = 1.0 if item.given else float(fitted.polished.scale)
-    deviation = np.median(1 / item.gain) * fitted.deviation * item.frame.unit * scale
+    deviation = item.typical * fitted.deviation * item.frame.unit * scale
     arrays = {
         "primitive": primitive,
         "inliers": inliers,
@@ -405,7 +406,7 @@ def _unknown(size: int, look: Look | None, status: Status, settings: Settings) -
     scores, margin, guards = ({}, 0.0, ()) if look is None else _told(look.fitted, settings.kinds)
     used = 0.0
     if look is not None:
-        deviation = float(np.median(1 / look.item.gain)) if look.item.given else look.expected
+        deviation = look.item.typical if look.item.given else look.expected
         used = DEVIATIONS * deviation * float(look.item.frame.unit)
     arrays = {
         "primitive": None,

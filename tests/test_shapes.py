@@ -344,5 +344,5 @@ def test_error_bars_are_calibrated(kind, size, camera):
 
 @pytest.mark.parametrize("double", [True, False])
 def test_threads_compute_in_the_precision_of_the_one_that_asks(double):
-    with jax.enable_x64(double), looks._threads(1) as pool:
+    with jax.enable_x64(double), looks.threads(1) as pool:
         assert pool.submit(lambda: jnp.ones(1).dtype).result() == jnp.ones(1).dtype
