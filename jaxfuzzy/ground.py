@@ -69,11 +69,13 @@ class Foreground:
         mask: The points of objects, or at least of neither ground nor wall.
         walls: The walls that were removed, the rearmost first.
         cut: Height in metres, of the median point, up to which points were taken for ground.
+        ground: These points, and what lies below.
     """
 
     mask: Bool[Array, " N"]
     walls: tuple[Plane, ...]
     cut: Float[Array, ""]
+    ground: Bool[Array, " N"]
 
 
 def find_ground(
@@ -191,13 +193,14 @@ def foreground(
     eye = None if camera is None else checks.position(camera, "camera").astype(x.dtype)
     std, known = _deviation(x, kept, "auto", ground.depth_std, eye)
     ray, floor = noise_of(x, std, eye)
-    cut, table = jnp.zeros((), cloud.dtype), np.asarray(ground.inliers)
+    cut, table, flat = jnp.zeros((), cloud.dtype), np.asarray(ground.inliers), np.zeros(len(x), bool)
     axis = checks.direction(up, "up")
     if ground.plane is not None:
         axis = np.asarray(ground.plane.normal)
         height = (x - np.asarray(ground.plane.point)) @ axis
         least = ABOVE * deviation_across(axis, ray, floor)
-        kept &= height > least
+        flat = height <= least
+        kept &= ~flat
         cut = jnp.asarray(np.median(least))
     prior = prior_of(axis, (np.pi / 2, np.pi / 9, np.pi * 2 / 9), eye, cloud.dtype, anywhere=True)
     walls: list[Plane] = []
@@ -219,7 +222,7 @@ def foreground(
         walls.append(_rectangle(x[on], normal, offset))
         standing &= residual >= -ABOVE
         kept = ahead
-    return Foreground(jax.device_put(kept), tuple(walls), cut)
+    return Foreground(jax.device_put(kept), tuple(walls), cut, jax.device_put(flat))
 
 
 def upright(points: Float[ArrayLike, "N 3"], ground: Plane) -> tuple[Array, Array, Array]:

@@ -27,8 +27,8 @@ Fit = Callable[[Sequence[np.ndarray]], tuple[Shape, ...]]
 # of the body's own group, of which the second share at least must lie on its surface.
 INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
 # Only neighbours are tried together: centers nearer than this share of the sum of their reaches, or than the second one where
-# something hides most of so many places on the way between them; and so many pairs at most.
-NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 5, 16
+# something hides most of so many stops on the way between them that are on neither; and so many pairs at most.
+NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 12, 16
 # For that a fair share of all points is looked at: so many, and less than twice as many.
 LOOKED_AT = 12_000
 # Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
@@ -225,16 +225,21 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, members: Sequence[np.ndar
 
 
 def _way_hidden(view: View, pair: tuple[int, int]) -> bool:
-    """Whether other groups stand before most of the way from one group to another."""
+    """Whether other groups stand before most of the way from one group to another, where it leads over neither."""
     one, other = view.middle[list(pair)]
-    share = ((np.arange(STOPS) + 1) / (STOPS + 1))[:, None]
-    way = (1 - share) * one + share * other
-    far = np.linalg.norm(way, axis=1)
-    # As near in the view as half a stop.
-    reach = np.linalg.norm(other / np.linalg.norm(other) - one / np.linalg.norm(one)) / (STOPS + 1) / 2
-    near = 2 - 2 * view.ray @ (way / far[:, None]).T < reach**2
-    others = (view.group != pair[0]) & (view.group != pair[1])
-    return bool((near & (view.depth[:, None] < far) & others[:, None]).any(axis=0).mean() > 0.5)
+    here, there = one / np.linalg.norm(one), other / np.linalg.norm(other)
+    way = there - here
+    length = float(way @ way)
+    if length == 0:
+        return False
+    along = (view.ray - here) @ way / length
+    aside = ((view.ray - here - along[:, None] * way) ** 2).sum(axis=1)
+    on = np.flatnonzero((along >= 0) & (along < 1) & (aside < length / STOPS**2))
+    stop, own = (along[on] * STOPS).astype(int), np.isin(view.group[on], pair)
+    before = view.depth[on] < (1 - along[on]) * np.linalg.norm(one) + along[on] * np.linalg.norm(other)
+    gap = np.bincount(stop[own], minlength=STOPS) == 0
+    hidden = np.bincount(stop[~own & before], minlength=STOPS) > 0
+    return bool(hidden[gap].sum() > 0.5 * gap.sum())
 
 
 def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Shape) -> Shape:

@@ -45,6 +45,8 @@ HOPELESS = 0.35
 LEAST_SHARE = 0.1
 # Noise found over noise first thought from which on, and below which, the search is repeated with what was found.
 UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
+# Sine of the angle from which on two normals tell an axis, and of the error of a normal.
+APART, SLANT = 0.3, 0.1
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
 
@@ -223,8 +225,8 @@ def _with_noise_found(look: Look) -> Prepared:
 
 def _turned(look: Look, settings: Settings) -> list[Prepared]:
     """The points searched with other verticals: square to most normals, as the axis of a lying cylinder is, and along most."""
-    item, normals, n = look.item, look.fitted.normals, look.fitted_to
-    axes = np.linalg.eigh(normals.T @ normals)[1].T[[0, 2]] @ item.frame.turn
+    item, normals, n = look.item, np.asarray(look.fitted.normals), look.fitted_to
+    axes = np.stack([_square_to_most(normals), np.linalg.eigh(normals.T @ normals)[1][:, 2]]) @ item.frame.turn
     p, deviation = _in_metres(look, slice(n))
     found = []
     for axis in axes:
@@ -232,6 +234,21 @@ def _turned(look: Look, settings: Settings) -> list[Prepared]:
             new = prepared(p, item.weight[:n], deviation, axis, settings.camera, settings.along_ray)
             found.append(new._replace(order=item.order[:n][new.order], given=True))
     return found
+
+
+def _square_to_most(normals: np.ndarray) -> np.ndarray:
+    """The direction to which most normals (W, 3) are square, of those that two of them span; normals of edges do no harm."""
+    one, other = np.triu_indices(len(normals), 1)
+    across = np.cross(normals[one], normals[other])
+    length = np.linalg.norm(across, axis=1)
+    # Two that are nearly the same say nothing, and unusable ones are zero.
+    across = across[length > APART] / length[length > APART, None]
+    if not len(across):
+        return np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    square = (normals @ across.T / SLANT) ** 2
+    best = across[np.argmin((square / (1 + square)).sum(axis=0))]
+    weight = 1 / (1 + (normals @ best / SLANT) ** 2) ** 2
+    return np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
 
 
 def _whole(new: Prepared, look: Look, settings: Settings) -> Prepared:

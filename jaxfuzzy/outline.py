@@ -5,7 +5,6 @@ surface goes on where the object does not, and there the camera looks through it
 whose viewing ray passes the surface within its ends has a say; what was not matched has none, and what stands before it neither.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
-from jaxfuzzy.shapes import Shape
+from jaxfuzzy.shapes import Shape, refused
 from jaxfuzzy.status import Status
 
 # A surface is refused when so large a share of the points that pass it lies behind. Right ones: at most 0.02 on rendered tables,
@@ -89,7 +88,7 @@ def without_seen_through(
             mine[own] = True
             held = np.asarray(points[own[inliers]], float)
             if _seen_through(shape.primitive, float(shape.noise_distance), held, mine[sight.which], sight) > THROUGH:
-                shape = _refused(shape)
+                shape = refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
         told.append(shape)
     return tuple(told)
 
@@ -174,15 +173,3 @@ def _extended(body: Primitive) -> bool:
         case Box():
             return float(np.min(np.asarray(body.size))) > 0
     return True
-
-
-def _refused(shape: Shape) -> Shape:
-    return dataclasses.replace(
-        shape,
-        kind="unknown",
-        primitive=None,
-        inliers=jnp.zeros_like(shape.inliers),
-        covariance=jnp.zeros((0, 0), shape.covariance.dtype),
-        status=jnp.asarray(Status.REFUSED | Status.SEEN_THROUGH, jnp.int32),
-        guards=(*shape.guards, f"{shape.kind}: what stands behind is seen where it would hide it"),
-    )

@@ -14,6 +14,7 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, record, static
 from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.evidence import with_correlated_errors
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
@@ -23,6 +24,7 @@ from jaxfuzzy.objects import OF_SCENE
 from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.photos import read_pair, rectify
+from jaxfuzzy.pieces import without_pieces
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.segment import Segmentation, segment
@@ -36,9 +38,6 @@ CAMERA_UP = (0.0, -1.0, 0.0)
 # How far in radians a supporting plane may lean from a vertical that was given.
 KNOWN_TILT = 0.15
 FEWEST_POINTS = 50
-# Neighboring pixels that together tell as much of a size as one independent point: 84 to 335, 190 on average, against the
-# ground truth of thirteen real pairs (`measure_noise`). Points without pixels count one each.
-PIXELS_PER_POINT = 190
 # A group that rises above the ground by no more than this share of the highest one's height is part of the ground.
 FLAT = 0.05
 SEGMENT_OPTIONS = ("ks",)
@@ -201,7 +200,7 @@ def _model(
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
-    thickness = 0.0
+    thickness, flat = 0.0, np.zeros(count, bool)
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
     along_ray = camera is not None and options.get("distance", "ray") == "ray"
     with compiling_ahead(OF_SCENE, points.dtype, along_ray):
@@ -212,7 +211,7 @@ def _model(
                 )
                 standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
                 kept &= np.asarray(standing.mask)
-                thickness = float(standing.cut)
+                thickness, flat = float(standing.cut), np.asarray(standing.ground)
                 plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
                 vertical = vertical if plane is None else np.asarray(plane.normal)
         if isinstance(noise_distance, str) and deviation is not None:
@@ -259,11 +258,14 @@ def _model(
             members = members_of(parts)
         if sight is not None:
             shapes = without_seen_through(points, [own[m] for m in members], shapes, sight)
+            if cloud.pixels_px is not None:
+                depth = np.linalg.norm(points - eye, axis=1)
+                shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, [own[m] for m in members], shapes)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
         if cloud.pixels_px is not None:
-            shapes = tuple(_with_correlated_errors(shape) for shape in shapes)
+            shapes = with_correlated_errors(shapes, OF_SCENE)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,
@@ -299,15 +301,6 @@ def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane) -> np.ndarr
     rises = [np.quantile(height[labels == k], 0.95) for k in range(labels.max() + 1)]
     flat = np.flatnonzero(np.array(rises) < FLAT * max(rises, default=0.0))
     return ~np.isin(labels, flat)
-
-
-def _with_correlated_errors(shape: Shape) -> Shape:
-    """The shape with the covariance of points of which many neighbors err alike."""
-    count = max(len(shape.inliers), 1)
-    worth = max(1.0, PIXELS_PER_POINT * min(count, OF_SCENE) / count)
-    return dataclasses.replace(
-        shape, covariance=jnp.asarray(np.asarray(shape.covariance) * worth, shape.covariance.dtype)
-    )
 
 
 def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:

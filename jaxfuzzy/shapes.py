@@ -24,6 +24,8 @@ from jaxfuzzy.quadrics import quadric_of
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
+# Of these bits a quadric has the first alone.
+NO_QUADRIC = Status.REFUSED | Status.ALL_NOISE | Status.SEEN_THROUGH | Status.PIECE
 # Nats of margin below which the next kind is nearly as good.
 NARROW = 10.0
 GUARDS = {
@@ -237,7 +239,7 @@ def with_quadrics(
 ) -> tuple[Shape, ...]:
     """Names "quadric" what is refused as every kind but lies on a general quadric; its status stays REFUSED.
 
-    What is refused since things are seen through it lies on some surface, and is none all the same.
+    What is refused since things are seen through it or since it goes on lies on some surface, and is none all the same.
 
     Args:
         points: Points (N, 3) in metres.
@@ -248,15 +250,27 @@ def with_quadrics(
     weight = np.ones(len(points)) if weights is None else np.asarray(weights, float)
     told = []
     for own, shape in zip(members, shapes, strict=True):
-        refused = int(shape.status) & (Status.REFUSED | Status.ALL_NOISE | Status.SEEN_THROUGH) == Status.REFUSED
         found = None
-        if shape.primitive is None and refused:
+        if shape.primitive is None and int(shape.status) & NO_QUADRIC == Status.REFUSED:
             found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
         if found is not None:
             quadric = jax.tree.map(lambda a: jnp.asarray(a, points.dtype), found[0])
             shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jnp.asarray(found[1]))
         told.append(shape)
     return tuple(told)
+
+
+def refused(shape: Shape, status: Status, why: str) -> Shape:
+    """The same object as "unknown", though a surface holds its points."""
+    return dataclasses.replace(
+        shape,
+        kind="unknown",
+        primitive=None,
+        inliers=jnp.zeros_like(shape.inliers),
+        covariance=jnp.zeros((0, 0), shape.covariance.dtype),
+        status=jnp.asarray(Status.REFUSED | status, jnp.int32),
+        guards=(*shape.guards, f"{shape.kind}: {why}"),
+    )
 
 
 def _by_most_points(

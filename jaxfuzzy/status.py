@@ -41,6 +41,7 @@ class Status(enum.IntFlag):
     RAN_AWAY = 1 << 26
     SCATTERED = 1 << 27
     SEEN_THROUGH = 1 << 28
+    PIECE = 1 << 29
 
 
 SENTENCES: dict[Status, str] = {
@@ -81,6 +82,8 @@ SENTENCES: dict[Status, str] = {
     " too small.",
     Status.SEEN_THROUGH: "The best surface would hide things that are seen behind it: the object has another outline, or holes, or"
     " is several; see the guards for the kind.",
+    Status.PIECE: "A piece of something larger: most of its border in the picture is no step in depth, so its surface goes on; see"
+    " the guards for the kind.",
 }
 
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.groups import by_shapes
+from jaxfuzzy.groups import _seen_from, _way_hidden, by_shapes
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
 from synthetic import fitted_shape
@@ -144,3 +144,17 @@ def test_halves_far_apart_are_merged_where_something_hides_what_is_between():
         assert by_shapes(points, ACROSS, parts, shapes, fit, camera)[0] is parts
     merged, found = by_shapes(points, ACROSS, parts, shapes, fit, np.zeros(3))
     assert merged.k == len(found) == 2
+
+
+def test_halves_are_merged_behind_a_thin_thing_too():
+    # Most of the way leads over the halves themselves; something stands before the fifth between them.
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.05, 0.4, 3000) * np.repeat([-1, 1], 1500)
+    bar = np.stack([rng.uniform(-0.04, 0.04, 400), rng.uniform(-0.1, 0.1, 400), np.full(400, 0.8)], axis=1)
+    points = np.concatenate([np.stack([x, rng.uniform(-0.05, 0.05, 3000), np.ones(3000)], axis=1), bar])
+    view = _seen_from(np.zeros(3), points, [np.arange(1500), np.arange(1500, 3000), np.arange(3000, 3400)])
+    assert _way_hidden(view, (0, 1))
+    behind = view._replace(depth=np.where(view.group == 2, 3.0, view.depth))
+    assert not _way_hidden(behind, (0, 1))
+    # Where points of their own are between them, nothing is hidden.
+    assert not _way_hidden(view._replace(group=np.where(view.group == 2, 0, view.group)), (0, 1))

@@ -346,3 +346,22 @@ def test_error_bars_are_calibrated(kind, size, camera):
 def test_threads_compute_in_the_precision_of_the_one_that_asks(double):
     with jax.enable_x64(double), looks.threads(1) as pool:
         assert pool.submit(lambda: jnp.ones(1).dtype).result() == jnp.ones(1).dtype
+
+
+def test_an_axis_is_square_to_most_normals_though_a_third_are_of_edges():
+    rng = np.random.default_rng(0)
+    truth = np.array([0.6, 0.0, 0.8])
+    around = np.linspace(-1.2, 1.2, 16)
+    side = np.cos(around)[:, None] * np.cross(truth, [0, 1, 0]) + np.sin(around)[:, None] * np.array([0, 1.0, 0])
+    side += rng.normal(0, 0.02, side.shape)
+    # Edges of a hand's breadth look one way; unusable normals are zero.
+    edges = np.array([0.5, 0.1, 0.86]) + rng.normal(0, 0.1, (8, 3))
+    normals = np.concatenate([side, edges, np.zeros((4, 3))])
+    normals[:24] /= np.linalg.norm(normals[:24], axis=1, keepdims=True)
+    axis = looks._square_to_most(normals)
+    plain = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    # 16 normals wrong by 0.02 each leave less than that; of all of them it would be far off.
+    assert np.degrees(np.arccos(abs(axis @ truth))) < 1.5 < 20 < np.degrees(np.arccos(abs(plain @ truth)))
+    # Without two that differ any direction square to the one will do.
+    alone = looks._square_to_most(np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert abs(alone[1]) < 1e-12

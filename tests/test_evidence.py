@@ -1,0 +1,91 @@
+"""What pixels that err alike leave of scores and covariances, worked by hand."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfuzzy.choice import PLANE_BONUS
+from jaxfuzzy.evidence import FEWEST, NARROW, PIXELS_PER_POINT, TELLS, with_correlated_errors
+from jaxfuzzy.primitives import Cylinder, Plane
+from jaxfuzzy.shapes import GUARDS
+from jaxfuzzy.status import Status
+from synthetic import fitted_shape
+
+BODY = Cylinder(jnp.zeros(3), jnp.array([0, 1.0, 0]), jnp.asarray(0.1), jnp.asarray(0.3))
+FLAT = Plane(jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros((4, 3)))
+FITTED_TO = 2048
+PIXELS = 10 * FITTED_TO
+# Each point fitted to stands for ten pixels.
+WORTH = PIXELS_PER_POINT / 10
+
+
+def told(scores, body=BODY, pixels=PIXELS, guards=()):
+    """A shape with these scores, in nats of independent points, as it comes back."""
+    worth = max(1, PIXELS_PER_POINT * min(pixels, FITTED_TO) / pixels)
+    passed = sorted(s for k, s in scores.items() if not any(g.startswith(k) for g in guards))
+    shape = dataclasses.replace(
+        fitted_shape(body, np.ones(pixels, bool), 0.01),
+        scores={k: s * worth for k, s in scores.items()},
+        margin=(passed[1] - passed[0]) * worth,
+        covariance=jnp.eye(2),
+        guards=guards,
+    )
+    return with_correlated_errors([shape], FITTED_TO)[0]
+
+
+def test_scores_margin_and_covariance_are_those_of_independent_points():
+    scores = {"plane": 30.0, "cylinder": 0.0, "sphere": 12.0}
+    shape = told(scores)
+    assert shape.kind == "cylinder"
+    assert int(shape.status) == 0
+    assert shape.scores == pytest.approx(scores)
+    assert shape.margin == pytest.approx(12)
+    np.testing.assert_allclose(shape.covariance, WORTH * np.eye(2), rtol=1e-6)
+    # Pixels beyond those that err alike cost nothing.
+    np.testing.assert_allclose(told(scores, pixels=PIXELS_PER_POINT * FITTED_TO).covariance, np.eye(2))
+
+
+def test_a_narrow_margin_within_a_family_is_told():
+    scores = {"cylinder": 0.0, "cone": NARROW / 2, "sphere": 12.0}
+    shape = told(scores)
+    assert shape.kind == "cylinder"
+    assert int(shape.status) == Status.LOW_MARGIN
+    assert int(told(scores | {"cone": 2 * NARROW}).status) == 0
+
+
+def test_another_family_that_is_as_likely_refuses():
+    scores = {"cylinder": 0.0, "sphere": TELLS / 2, "box": -5.0}
+    guards = (f"box: {GUARDS['box']}",)
+    shape = told(scores, guards=guards)
+    assert shape.kind == "unknown"
+    assert shape.primitive is None
+    assert int(shape.status) == Status.REFUSED | Status.LOW_MARGIN
+    assert shape.guards == (*guards, "cylinder: another kind is as likely")
+    # A kind that a guard spoke against is no rival, nor is a cone one of a cylinder.
+    assert told(scores | {"sphere": 2 * TELLS, "cone": TELLS / 2}, guards=guards).kind == "cylinder"
+
+
+def test_the_bonus_of_planes_is_no_evidence():
+    bonus = PLANE_BONUS / WORTH
+    assert told({"plane": TELLS / 2 - bonus, "cylinder": 0.0}).kind == "unknown"
+    assert told({"plane": 2 * TELLS - bonus, "cylinder": 0.0}).kind == "cylinder"
+    assert told({"plane": 0.0, "cylinder": bonus + TELLS / 2}, body=FLAT).kind == "unknown"
+    assert told({"plane": 0.0, "cylinder": bonus + 2 * TELLS}, body=FLAT).kind == "plane"
+
+
+def test_too_few_independent_points_refuse():
+    scores = {"plane": 30.0, "cylinder": 0.0}
+    shape = told(scores, pixels=FEWEST * PIXELS_PER_POINT - 1)
+    assert shape.kind == "unknown"
+    assert int(shape.status) == Status.REFUSED | Status.TOO_FEW_POINTS
+    assert told(scores, pixels=FEWEST * PIXELS_PER_POINT).kind == "cylinder"
+
+
+def test_what_has_no_name_keeps_none():
+    shape = fitted_shape(None, np.zeros(50, bool), 0.01)
+    same = with_correlated_errors([shape], FITTED_TO)[0]
+    assert same.kind == "unknown"
+    assert int(same.status) == 0
+    assert same.guards == ()
