@@ -79,12 +79,13 @@ def _ended(
     sides = jnp.stack([cylinder, cone, *inner])
     steep = jnp.array([0.0, 1.0, 1.0, 0.0], few.gain.dtype)
 
-    # Each side with its rim at each height, with a lid and open.
-    tried = jnp.tile(height, 2 * len(sides))
-    ends = jnp.repeat(jnp.array([rays.CLOSED, rays.OPEN], few.gain.dtype), len(sides) * len(height))
-    many = jnp.tile(jnp.repeat(sides, len(height), axis=0), (2, 1))
-    many = many.at[:, 4].set(jnp.where(ends == rays.CLOSED, tried, floor))
-    rimmed = vessels_of(many, ends, tried, jnp.tile(jnp.repeat(steep, len(height)), 2))
+    # Each side with its rim at each height, open and, those seen from without, with a lid.
+    each = np.array([0, 1, 2, 3, 0, 1])
+    ends = jnp.array([rays.OPEN] * len(sides) + [rays.CLOSED] * 2, few.gain.dtype)
+    side, ends, slope = (jnp.repeat(a, len(height), axis=0) for a in (sides[each], ends, steep[each]))
+    tried = jnp.tile(height, len(each))
+    many = side.at[:, 4].set(jnp.where(ends == rays.CLOSED, tried, floor))
+    rimmed = vessels_of(many, ends, tried, slope)
 
     # The lid that was found, with bodies of a grid below it.
     theta = starts.lid_bodies(few, jnp.stack([window.cylinders[-1], window.cones[-1]]), lid)

@@ -151,7 +151,7 @@ def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: An
             `ground`: "auto" to look for a supporting plane and to leave out what belongs to it; None where the cloud has none,
             which needs `up`. `camera`: where the points were seen from (3,), the origin by default; None where not known.
             `ks`: numbers of objects allowed, as in `segment`. `kinds`, `distance`, `noise_distance`, `weights`: as in `fit_shape`.
-            Covariances of clouds with `pixels_px` allow for neighboring pixels that err alike.
+            Covariances, scores and margins of clouds with `pixels_px` allow for neighboring pixels that err alike.
             `rule`: "robust" (the default, for objects; "likelihood" is the same), "gric", or "paper" for the paper's own rules
             throughout.
 
@@ -264,7 +264,7 @@ def _model(
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
-        if cloud.pixels_px is not None:
+        if cloud.pixels_px is not None and shape_rule != "paper":
             shapes = with_correlated_errors(shapes, OF_SCENE)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
