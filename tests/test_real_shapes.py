@@ -1,9 +1,10 @@
-"""Real clouds whose shapes are known: a stereo cloud of a mug, depth-camera clouds of cartons and of tables with vessels."""
+"""Real data whose shapes are known: a stereo cloud of a mug, depth-camera clouds of cartons and tables, two photographs."""
 
 import numpy as np
 import pytest
 from sklearn.metrics import adjusted_rand_score
 
+import jaxfuzzy as jf
 from jaxfuzzy.cloud import Cloud, read_cloud
 from jaxfuzzy.scene import model_cloud
 from jaxfuzzy.shapes import fit_shape
@@ -57,3 +58,39 @@ def test_a_table_of_mosd_has_its_objects(shared_data, name):
     for i, shape in enumerate(scene.shapes):
         which = np.bincount(truth[labels == i]).argmax()
         assert shape.kind == TABLES[name][which - 2]
+
+
+def photographed(folder, left, right):
+    """The scene of a photograph, and which object most points around a place of it belong to."""
+    scene = jf.model_scene(folder / left, folder / right, jf.load_rig(folder / "calib.txt"))
+    pixels, labels = np.asarray(scene.cloud.pixels_px), np.asarray(scene.segmentation.labels)
+
+    def at(column, row):
+        here = labels[(np.abs(pixels - [column, row]).max(axis=1) <= 6) & (labels >= 0)]
+        return scene.shapes[np.bincount(here).argmax()]
+
+    return scene, at
+
+
+def test_a_lying_crayon_behind_a_brush_is_one_cylinder(shared_data):
+    scene, at = photographed(shared_data / "middlebury2005_art", "view1.png", "view5.png")
+    left, right = at(109, 313), at(237, 315)
+    assert left is right
+    assert [shape.kind for shape in scene.shapes].count("cylinder") == 1
+    assert left.kind == "cylinder"
+    # It lies, as long as six of its radii.
+    body = left.primitive
+    assert abs(np.asarray(body.axis) @ np.asarray(scene.up)) < 0.1
+    assert 5 < float(body.height / body.radius) < 7
+
+
+def test_of_the_paper_cones_nothing_is_named_wrongly(shared_data):
+    scene, at = photographed(shared_data / "middlebury2003_cones", "im2.png", "im6.png")
+    kinds = [shape.kind for shape in scene.shapes]
+    assert kinds.count("cone") >= 4
+    assert kinds.count("cylinder") == 1
+    assert set(kinds) <= {"cone", "cylinder", "quadric", "unknown"}
+    assert at(395, 320).kind == "cylinder"  # the mug
+    wall = at(160, 70)
+    assert wall.kind == "unknown"
+    assert jf.Status(int(wall.status)) & jf.Status.PIECE
