@@ -225,7 +225,7 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, members: Sequence[np.ndar
 
 
 def _way_hidden(view: View, pair: tuple[int, int]) -> bool:
-    """Whether other groups stand before most of the way from one group to another, where it leads over neither."""
+    """Whether other groups stand before most of the way from one group to another, where it leads mostly over neither."""
     one, other = view.middle[list(pair)]
     here, there = one / np.linalg.norm(one), other / np.linalg.norm(other)
     way = there - here
@@ -237,9 +237,9 @@ def _way_hidden(view: View, pair: tuple[int, int]) -> bool:
     on = np.flatnonzero((along >= 0) & (along < 1) & (aside < length / STOPS**2))
     stop, own = (along[on] * STOPS).astype(int), np.isin(view.group[on], pair)
     before = view.depth[on] < (1 - along[on]) * np.linalg.norm(one) + along[on] * np.linalg.norm(other)
-    gap = np.bincount(stop[own], minlength=STOPS) == 0
-    hidden = np.bincount(stop[~own & before], minlength=STOPS) > 0
-    return bool(hidden[gap].sum() > 0.5 * gap.sum())
+    theirs, ahead, behind = (np.bincount(stop[of], minlength=STOPS) for of in (own, ~own & before, ~own & ~before))
+    gap, hidden = theirs <= ahead + behind, ahead > np.maximum(theirs, behind)
+    return bool(hidden.sum() > 0.5 * gap.sum())
 
 
 def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Shape) -> Shape:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.choice import PLANE_BONUS
-from jaxfuzzy.evidence import FEWEST, NARROW, PIXELS_PER_POINT, TELLS, with_correlated_errors
+from jaxfuzzy.evidence import FEWEST, HOLDS, NARROW, PIXELS_PER_POINT, TELLS, with_correlated_errors
 from jaxfuzzy.primitives import Cylinder, Plane
 from jaxfuzzy.shapes import GUARDS
 from jaxfuzzy.status import Status
@@ -81,6 +81,13 @@ def test_too_few_independent_points_refuse():
     assert shape.kind == "unknown"
     assert int(shape.status) == Status.REFUSED | Status.TOO_FEW_POINTS
     assert told(scores, pixels=FEWEST * PIXELS_PER_POINT).kind == "cylinder"
+
+
+def test_a_surface_that_holds_few_of_its_points_is_refused():
+    for share, kind in ((HOLDS - 0.01, "unknown"), (HOLDS + 0.01, "cylinder")):
+        shape = fitted_shape(BODY, np.arange(PIXELS) < share * PIXELS, 0.01)
+        shape = dataclasses.replace(shape, scores={"plane": 1e3, "cylinder": 0.0}, margin=1e3)
+        assert with_correlated_errors([shape], FITTED_TO)[0].kind == kind
 
 
 def test_what_has_no_name_keeps_none():
