@@ -23,7 +23,7 @@ PIXELS_PER_POINT = 190
 FEWEST = 6
 # In nats of independent points: below, another family is as likely, and the next kind of the same family.
 TELLS, NARROW = 0.2, 1.0
-# Of its group's points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
+# Of its points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
 HOLDS = 0.3
 # A plane is a face of a box, a cylinder a cone that does not narrow.
 FAMILIES = {"plane": "flat", "box": "flat", "cylinder": "turned", "cone": "turned", "sphere": "sphere"}
