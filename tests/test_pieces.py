@@ -67,3 +67,13 @@ def test_how_much_of_the_border_may_go_on():
 
 def test_a_piece_of_a_plane_is_a_plane():
     assert told(np.full(INSIDE.shape, 2.0), body=FLAT).kind == "plane"
+
+
+@pytest.mark.parametrize("far", [1e12, np.nan])
+def test_a_picture_that_is_none_says_nothing(far):
+    pixels = np.stack([COLUMNS.ravel(), ROWS.ravel()], axis=1).astype(float)
+    pixels[0] = far
+    members = [np.flatnonzero(INSIDE.ravel())]
+    shapes = [fitted_shape(BODY, np.ones(len(members[0]), bool), 0.01)]
+    flat = np.full(len(pixels), 2.0)
+    assert without_pieces(pixels, flat, np.zeros(len(pixels), bool), members, shapes)[0].kind == "cylinder"
