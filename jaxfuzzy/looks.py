@@ -45,8 +45,9 @@ HOPELESS = 0.35
 LEAST_SHARE = 0.1
 # Noise found over noise first thought from which on, and below which, the search is repeated with what was found.
 UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
-# Sine of the angle from which on two normals tell an axis, and of the error of a normal.
-APART, SLANT = 0.3, 0.1
+# Sine of the angle from which on two normals tell an axis, and of the error of a normal; and the share that must agree on one: of
+# lying cylinders in photographs 0.75 and more, of blobs among outliers 0.54 and less.
+APART, SLANT, AGREE = 0.3, 0.1, 0.65
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
 
@@ -237,16 +238,23 @@ def _turned(look: Look, settings: Settings) -> list[Prepared]:
 
 
 def _square_to_most(normals: np.ndarray) -> np.ndarray:
-    """The direction to which most normals (W, 3) are square, of those that two of them span; normals of edges do no harm."""
+    """The direction to which most normals (W, 3) are square, of those that two of them span; normals of edges do no harm.
+
+    Where fewer than a share are square to it, as in a heap of outliers, it is the one that all are square to in the mean.
+    """
+    mean = np.linalg.eigh(normals.T @ normals)[1][:, 0]
     one, other = np.triu_indices(len(normals), 1)
     across = np.cross(normals[one], normals[other])
     length = np.linalg.norm(across, axis=1)
     # Two that are nearly the same say nothing, and unusable ones are zero.
     across = across[length > APART] / length[length > APART, None]
     if not len(across):
-        return np.linalg.eigh(normals.T @ normals)[1][:, 0]
+        return mean
     square = (normals @ across.T / SLANT) ** 2
     best = across[np.argmin((square / (1 + square)).sum(axis=0))]
+    usable = normals.any(axis=1)
+    if (np.abs(normals[usable] @ best) < SLANT).mean() < AGREE:
+        return mean
     weight = 1 / (1 + (normals @ best / SLANT) ** 2) ** 2
     return np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
 

@@ -1,3 +1,4 @@
+import contextlib
 import csv
 import io
 import json
@@ -496,6 +497,17 @@ def test_the_process_itself(tmp_path):
     assert process.wait(120) == 0
     assert err == "jaxfuzzy: fitting\n"
     assert any((tmp_path / "cache" / "jaxfuzzy").iterdir())
+
+
+def test_an_interrupt_that_was_swallowed_takes_effect_at_the_next_stage():
+    before = signal.getsignal(signal.SIGINT)
+    with terminal.Progress(quiet=True) as progress:
+        progress("matching", 0.0)
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            progress("ground", 0.1)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_ctrl_c_in_a_real_process(tmp_path):
