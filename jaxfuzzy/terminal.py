@@ -2,7 +2,6 @@
 
 import contextlib
 import shutil
-import signal
 import sys
 import threading
 import warnings
@@ -21,22 +20,14 @@ def columns(heads: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence
 
 
 class Progress:
-    """Stage and time left on standard error: a bar on a terminal where tqdm is installed, else one line a stage.
-
-    An interrupt that falls into a callback of another library is swallowed there; it takes effect at the next stage then.
-    """
+    """Stage and time left on standard error: a bar on a terminal where tqdm is installed, else one line a stage."""
 
     def __init__(self, quiet: bool) -> None:
-        self.quiet, self.stage, self.stopped = quiet, "", False
+        self.quiet, self.stage = quiet, ""
         self.bar: Any = None
         self.ended = threading.Event()
-        self.handler: Any = None
 
     def __enter__(self) -> "Progress":
-        main = threading.current_thread() is threading.main_thread()
-        # Where interrupts are ignored, as in the background of a shell, they stay so.
-        if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self.handler = signal.signal(signal.SIGINT, self._stop)
         if not self.quiet and sys.stderr.isatty():
             with contextlib.suppress(ImportError):
                 from tqdm import tqdm
@@ -58,8 +49,6 @@ class Progress:
 
     def __call__(self, stage: str, share: float) -> None:
         """Says that `stage` is going on and which share of all the work is done."""
-        if self.stopped:
-            raise KeyboardInterrupt
         if self.bar is not None:
             self.bar.set_description_str(stage, refresh=False)
             self.bar.update(max(share - self.bar.n, 0.0))
@@ -72,12 +61,6 @@ class Progress:
         self.ended.set()
         if self.bar is not None:
             self.bar.close()
-        if self.handler is not None:
-            signal.signal(signal.SIGINT, self.handler)
-
-    def _stop(self, *_: object) -> None:
-        self.stopped = True
-        raise KeyboardInterrupt
 
     def _tick(self) -> None:
         """Keeps the clock going through a long stage."""

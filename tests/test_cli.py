@@ -1,4 +1,3 @@
-import contextlib
 import csv
 import io
 import json
@@ -499,17 +498,15 @@ def test_the_process_itself(tmp_path):
     assert any((tmp_path / "cache" / "jaxfuzzy").iterdir())
 
 
-def test_an_interrupt_that_was_swallowed_takes_effect_at_the_next_stage():
-    before = signal.getsignal(signal.SIGINT)
-    with terminal.Progress(quiet=True) as progress:
-        progress("matching", 0.0)
-        with contextlib.suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            progress("ground", 0.1)
-    assert signal.getsignal(signal.SIGINT) is before
+@pytest.fixture
+def interrupts():
+    """In the background of a shell interrupts are ignored, and would be by a child too."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.usefixtures("interrupts")
 def test_ctrl_c_in_a_real_process(tmp_path):
     command = [sys.executable, "-m", "jaxfuzzy.cli", "demo", "--out", "found"]
     with subprocess.Popen(
