@@ -337,9 +337,9 @@ def _sizes(shape: Shape) -> np.ndarray:
 def duration(each: int, seed: int, cgal: str | None = None, **_: Any) -> dict[str, Any]:
     """Milliseconds an object, warm, in a batch of 24, in turn with CGAL; seconds of the first call in a fresh process."""
     given = clouds(KINDS, 5, seed, OUTLIERS)[:24]
-    turns = [(timings(lambda: named(given), 5), _of_cgal(given, cgal)) for _ in range(3)]
+    turns = [(timings(lambda: named(given), 5), _answers("cgal", cgal, given) if cgal else []) for _ in range(3)]
     seconds = {what: float(np.median([own[what] for own, _ in turns])) for what in turns[0][0]}
-    theirs = float(np.median([other for _, other in turns])) if cgal else None
+    theirs = [answer["ms"] for _, answers in turns for answer in answers]
     code = (
         "import sys, time; sys.path.insert(0, sys.argv[1]); import shapes as b;"
         "g = b.clouds(b.KINDS, 5, int(sys.argv[2]), b.OUTLIERS)[:24];"
@@ -355,19 +355,14 @@ def duration(each: int, seed: int, cgal: str | None = None, **_: Any) -> dict[st
         "ms_an_object": 1e3 * seconds["median"] / len(given),
         "ms_range": [1e3 * seconds["min"] / len(given), 1e3 * seconds["max"] / len(given)],
         "first_call_s": float(cold.stdout.split()[-1]),
-        "cgal_ms": theirs,
+        "cgal_ms": float(np.median(theirs)) if theirs else None,
     }
     table(
         "Time, batch of 24 (asked: 2.5 ms an object warm; compiling under 10 s)",
         ("ms an object, median", "fastest", "slowest", "CGAL in turn, ms", "first call in a fresh process, s"),
-        [(result["ms_an_object"], *result["ms_range"], theirs or "not run", result["first_call_s"])],
+        [(result["ms_an_object"], *result["ms_range"], result["cgal_ms"] or "not run", result["first_call_s"])],
     )
     return result
-
-
-def _of_cgal(given: Sequence[Simulated], cgal: str | None) -> float:
-    """Median milliseconds a cloud that CGAL takes, its normals included."""
-    return float(np.median([a["ms"] for a in _answers("cgal", cgal, given)])) if cgal else float("nan")
 
 
 def _answers(name: str, python: str, given: Sequence[Simulated]) -> list[dict[str, Any]]:

@@ -185,7 +185,7 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
     # Batches of one compiled size, side by side on the processors there are; two each, since some take longer than others.
     workers = os.cpu_count() or 1
     with threads(workers) as pool:
-        return [look for batch in pool.map(fit, batches(range(len(items)), 2 * workers)) for look in batch]
+        return [found for batch in pool.map(fit, batches(range(len(items)), 2 * workers)) for found in batch]
 
 
 def _reason(look: Look) -> Status:

@@ -257,10 +257,11 @@ def _model(
             parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
             members = members_of(parts)
         if sight is not None:
-            shapes = without_seen_through(points, [own[m] for m in members], shapes, sight)
+            mine = [own[m] for m in members]
+            shapes = without_seen_through(points, mine, shapes, sight)
             if cloud.pixels_px is not None:
                 depth = np.linalg.norm(points - eye, axis=1)
-                shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, [own[m] for m in members], shapes)
+                shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, mine, shapes)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)

@@ -82,7 +82,7 @@ SENTENCES: dict[Status, str] = {
     " too small.",
     Status.SEEN_THROUGH: "The best surface would hide things that are seen behind it: the object has another outline, or holes, or"
     " is several; see the guards for the kind.",
-    Status.PIECE: "A piece of something larger: most of its border in the picture is no step in depth, so its surface goes on; see"
+    Status.PIECE: "A piece of something larger: much of its border in the picture is no step in depth, so its surface goes on; see"
     " the guards for the kind.",
 }
 
