@@ -6,13 +6,13 @@ to no evidence is not named.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.choice import PLANE_BONUS
-from jaxfuzzy.search import KINDS
+from jaxfuzzy.search import KINDS, MORE
 from jaxfuzzy.shapes import Shape, refused
 from jaxfuzzy.status import Status
 
@@ -21,49 +21,72 @@ from jaxfuzzy.status import Status
 PIXELS_PER_POINT = 190
 # As many independent points as the largest number of parameters of a kind.
 FEWEST = 6
-# In nats of independent points: below, another family is as likely, and the next kind of the same family.
-TELLS, NARROW = 0.2, 1.0
+# In nats of independent points: below, another family is as likely, and the next kind is nearly as good.
+TELLS, NARROW = 1.0, 3.0
 # Of its points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
 HOLDS = 0.3
 # A plane is a face of a box, a cylinder a cone that does not narrow.
 FAMILIES = {"plane": "flat", "box": "flat", "cylinder": "turned", "cone": "turned", "sphere": "sphere"}
 
 
-def with_correlated_errors(shapes: Sequence[Shape], fitted_to: int) -> tuple[Shape, ...]:
-    """Shapes with the covariance, scores and margin that independent points leave; "unknown" where these do not tell.
+def in_independent_points(shapes: Sequence[Shape], fitted_to: int) -> tuple[Shape, ...]:
+    """Shapes with the covariance, scores and margin that independent points leave.
 
     Args:
-        shapes: Shapes of points that are pixels.
-        fitted_to: Points of each that its scores and its covariance were counted from at most.
+        shapes: Shapes of points that are pixels, their scores in nats of all points that these were counted from.
+        fitted_to: Points that each was fitted to at most.
     """
-    return tuple(_with_correlated_errors(shape, fitted_to) for shape in shapes)
+    return tuple(_in_independent_points(shape, fitted_to) for shape in shapes)
 
 
-def _with_correlated_errors(shape: Shape, fitted_to: int) -> Shape:
-    count = max(len(shape.inliers), 1)
-    worth = max(1.0, PIXELS_PER_POINT * min(count, fitted_to) / count)
-    status = int(shape.status) & ~Status.LOW_MARGIN
-    if shape.kind in KINDS and shape.margin / worth < NARROW:
-        status |= Status.LOW_MARGIN
-    shape = dataclasses.replace(
+def told_apart(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+    """Shapes whose scores and margins are those of independent points, "unknown" where these do not tell."""
+    return tuple(_told_apart(shape) for shape in shapes)
+
+
+def worth(count: int, used: int) -> float:
+    """How many of the points used, of so many in all, tell as much as one independent point."""
+    return max(1.0, PIXELS_PER_POINT * min(count, used) / max(count, 1))
+
+
+def spoken_against(shape: Shape) -> set[str]:
+    """Kinds that a guard spoke against."""
+    return {guard.split(":")[0] for guard in shape.guards}
+
+
+def margin_of(shape: Shape, scores: Mapping[str, float]) -> float:
+    """Score of the next best kind that no guard spoke against less that of the shape's own."""
+    spoken = spoken_against(shape)
+    rivals = [score for kind, score in scores.items() if kind != shape.kind and kind not in spoken]
+    return min(rivals) - scores[shape.kind] if rivals and shape.kind in scores else float("inf")
+
+
+def _in_independent_points(shape: Shape, fitted_to: int) -> Shape:
+    count = len(shape.inliers)
+    each, common = worth(count, MORE), worth(count, fitted_to)
+    return dataclasses.replace(
         shape,
-        scores={kind: score / worth for kind, score in shape.scores.items()},
-        margin=shape.margin / worth,
-        covariance=jnp.asarray(np.asarray(shape.covariance) * worth, shape.covariance.dtype),
-        status=jnp.asarray(status, jnp.int32),
+        scores={kind: score / each for kind, score in shape.scores.items()},
+        margin=shape.margin / each,
+        covariance=jnp.asarray(np.asarray(shape.covariance) * common, shape.covariance.dtype),
     )
+
+
+def _told_apart(shape: Shape) -> Shape:
     if shape.kind not in KINDS:
         return shape
+    count = len(shape.inliers)
+    status = int(shape.status) & ~Status.LOW_MARGIN | (Status.LOW_MARGIN if shape.margin < NARROW else 0)
+    shape = dataclasses.replace(shape, status=jnp.asarray(status, jnp.int32))
     if count < FEWEST * PIXELS_PER_POINT:
         return refused(shape, Status.TOO_FEW_POINTS, "too few pixels for the errors that they share")
     if np.asarray(shape.inliers).mean() < HOLDS:
         return refused(shape, Status(0), "it holds too few of the object's points")
-    return refused(shape, Status.LOW_MARGIN, "another kind is as likely") if _lead(shape, worth) < TELLS else shape
+    return refused(shape, Status.LOW_MARGIN, "another kind is as likely") if _lead(shape) < TELLS else shape
 
 
-def _lead(shape: Shape, worth: float) -> float:
+def _lead(shape: Shape) -> float:
     """Nats by which a kind leads the best one of another family that no guard spoke against, without the bonus of planes."""
-    spoken = {guard.split(":")[0] for guard in shape.guards}
-    scores = {k: s + PLANE_BONUS / worth * (k == "plane") for k, s in shape.scores.items() if k not in spoken}
-    others = [s for k, s in scores.items() if FAMILIES[k] != FAMILIES[shape.kind]]
-    return min(others) - scores[shape.kind] if others and shape.kind in scores else float("inf")
+    bonus = PLANE_BONUS / worth(len(shape.inliers), MORE)
+    others = {k: s + bonus * (k == "plane") for k, s in shape.scores.items()}
+    return margin_of(shape, {k: s for k, s in others.items() if k == shape.kind or FAMILIES[k] != FAMILIES[shape.kind]})

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfuzzy.fitting import Fitted, fit_batch
 from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, prepared, stacked, with_more
-from jaxfuzzy.search import KINDS
+from jaxfuzzy.search import KINDS, MORE
 from jaxfuzzy.status import Status
 
 FEWEST = 12
@@ -99,11 +99,15 @@ class Look(NamedTuple):
         return Status.SCATTERED if self.item.given and self.fitted.local > SCATTERED else Status(0)
 
     @property
+    def unit_of_score(self) -> float:
+        """What is taken from scores to make them independent of what deviation they were searched with."""
+        n = min(self.fitted_to, MORE)
+        return float(self.item.weight[:n] @ np.log(self.item.gain[:n] / self.fitted.deviation))
+
+    @property
     def score(self) -> float:
         """Score of the surface, made independent of what deviation it was searched with."""
-        n = self.fitted_to
-        logs = self.item.weight[:n] @ np.log(self.item.gain[:n] / self.fitted.deviation)
-        return float(self.fitted.scores[self.fitted.kind] - logs)
+        return float(self.fitted.scores[self.fitted.kind]) - self.unit_of_score
 
 
 def unfit(item: Prepared | None) -> Status:
@@ -137,7 +141,7 @@ def look_at(items: Sequence[Prepared], settings: Settings) -> list[Look]:
     for (i, look, _), new in zip(turned, others, strict=True):
         # Another vertical is one more freedom: what it finds must fit well.
         if not new.reason and new.misfit <= SUSPECT and (looks[i].reason or new.score < looks[i].score):
-            looks[i] = new._replace(item=_whole(new.item, look, settings))
+            looks[i] = _knowing(new, looks[i])._replace(item=_whole(new.item, look, settings))
     return looks
 
 
@@ -257,6 +261,15 @@ def _square_to_most(normals: np.ndarray) -> np.ndarray:
         return mean
     weight = 1 / (1 + (normals @ best / SLANT) ** 2) ** 2
     return np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
+
+
+def _knowing(new: Look, other: Look) -> Look:
+    """A look that knows what another one found: of the kinds that it did not take, the better score of the two."""
+    theirs = np.asarray(other.fitted.scores) - other.unit_of_score + new.unit_of_score
+    better = (theirs < new.fitted.scores) & (np.arange(len(KINDS)) != new.fitted.kind)
+    pick: Any = lambda of, own: np.where(better, of, own)
+    scores, passed = pick(theirs, new.fitted.scores), pick(other.fitted.passed, new.fitted.passed)
+    return new._replace(fitted=new.fitted._replace(scores=scores, passed=passed))
 
 
 def _whole(new: Prepared, look: Look, settings: Settings) -> Prepared:

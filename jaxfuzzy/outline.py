@@ -80,21 +80,45 @@ def without_seen_through(
         shapes: The shapes.
         sight: What the camera sees.
     """
-    told = []
-    for own, shape in zip(members, shapes, strict=True):
-        inliers = np.asarray(shape.inliers)
-        if shape.primitive is not None and not isinstance(shape.primitive, Quadric) and inliers.any():
-            mine = np.zeros(len(points), bool)
-            mine[own] = True
-            held = np.asarray(points[own[inliers]], float)
-            if _seen_through(shape.primitive, float(shape.noise_distance), held, mine[sight.which], sight) > THROUGH:
-                shape = refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
-        told.append(shape)
-    return tuple(told)
+    return tuple(
+        refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
+        if seen_through(points, own, shape, sight).share > THROUGH
+        else shape
+        for own, shape in zip(members, shapes, strict=True)
+    )
 
 
-def _seen_through(body: Primitive, noise_distance: float, held: np.ndarray, mine: np.ndarray, sight: Sight) -> float:
-    """Share of the points whose rays pass a surface that lies behind it."""
+class Through(NamedTuple):
+    """What is seen through a surface.
+
+    Attributes:
+        share: Of the points whose rays pass the surface those that lie behind it, less what outliers explain.
+        points: How many of the cloud's points that are.
+    """
+
+    share: float
+    points: float
+
+
+def seen_through(points: np.ndarray, own: np.ndarray, shape: Shape, sight: Sight) -> Through:
+    """What is seen through a shape; nothing where it is none.
+
+    Args:
+        points: All points (N, 3), those `sight_of` was given.
+        own: Indices of the shape's points.
+        shape: The shape.
+        sight: What the camera sees.
+    """
+    inliers = np.asarray(shape.inliers)
+    if shape.primitive is None or isinstance(shape.primitive, Quadric) or not inliers.any():
+        return Through(0.0, 0.0)
+    mine = np.zeros(len(points), bool)
+    mine[own] = True
+    held = np.asarray(points[own[inliers]], float)
+    return _through(shape.primitive, float(shape.noise_distance), held, mine[sight.which], sight)
+
+
+def _through(body: Primitive, noise_distance: float, held: np.ndarray, mine: np.ndarray, sight: Sight) -> Through:
     hit = _hits(body, held, sight)
     met = np.flatnonzero(np.isfinite(hit))
     hit, depth = hit[met], sight.depth[met]
@@ -116,7 +140,9 @@ def _seen_through(body: Primitive, noise_distance: float, held: np.ndarray, mine
         total = np.maximum(slices[0] + slices[1], 1)
         best = np.argsort((slices[1] - slices[2]) / total)[:-WORST]
         on, behind, stray = slices[:, best].sum(axis=1)
-    return float((behind - stray) / (on + behind)) if on + behind >= FEWEST else 0.0
+    if on + behind < FEWEST:
+        return Through(0.0, 0.0)
+    return Through(float((behind - stray) / (on + behind)), float((behind - stray) * (sight.which.step or 1)))
 
 
 def _hits(body: Primitive, held: np.ndarray, sight: Sight) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, record, static
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.evidence import with_correlated_errors
+from jaxfuzzy.evidence import in_independent_points, told_apart
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
@@ -27,6 +27,7 @@ from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.pieces import without_pieces
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
+from jaxfuzzy.rivals import chosen_by_outline
 from jaxfuzzy.segment import Segmentation, segment
 from jaxfuzzy.shapes import Shape, fit_members, with_quadrics
 from jaxfuzzy.stereo import reconstruct
@@ -247,26 +248,37 @@ def _model(
             loose[own[np.concatenate([np.zeros(0, int), *members])]] = False
             sight = sight_of(points, loose, eye, np.asarray(vertical, float))
 
+        def fitted(sets: Sequence[np.ndarray], **only: Any) -> tuple[Shape, ...]:
+            return fit_members(places, sets, **seen(own) | picked | {"rule": shape_rule, "capacity": OF_SCENE} | only)
+
         def fit(sets: Sequence[np.ndarray]) -> tuple[Shape, ...]:
-            found = fit_members(places, sets, rule=shape_rule, capacity=OF_SCENE, **seen(own), **picked)
+            found = fitted(sets)
             return found if sight is None else without_seen_through(points, [own[m] for m in sets], found, sight)
+
+        def as_kind(of: Sequence[int], kind: str) -> tuple[Shape, ...]:
+            return in_independent_points(fitted([members[i] for i in of], kinds=(kind,)), OF_SCENE)
 
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
             across = np.asarray(tangents(jnp.asarray(vertical)))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
             members = members_of(parts)
+        correlated = cloud.pixels_px is not None and shape_rule != "paper"
+        if correlated:
+            shapes = in_independent_points(shapes, OF_SCENE)
         if sight is not None:
             mine = [own[m] for m in members]
+            if correlated:
+                shapes = chosen_by_outline(points, mine, shapes, sight, as_kind)
             shapes = without_seen_through(points, mine, shapes, sight)
-            if cloud.pixels_px is not None:
+            if correlated:
                 depth = np.linalg.norm(points - eye, axis=1)
                 shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, mine, shapes)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
-        if cloud.pixels_px is not None and shape_rule != "paper":
-            shapes = with_correlated_errors(shapes, OF_SCENE)
+        if correlated:
+            shapes = told_apart(shapes)
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.choice import PLANE_BONUS
-from jaxfuzzy.evidence import FEWEST, HOLDS, NARROW, PIXELS_PER_POINT, TELLS, with_correlated_errors
+from jaxfuzzy.evidence import FEWEST, HOLDS, NARROW, PIXELS_PER_POINT, TELLS, in_independent_points, told_apart
 from jaxfuzzy.primitives import Cylinder, Plane
 from jaxfuzzy.shapes import GUARDS
 from jaxfuzzy.status import Status
@@ -15,15 +15,15 @@ from synthetic import fitted_shape
 
 BODY = Cylinder(jnp.zeros(3), jnp.array([0, 1.0, 0]), jnp.asarray(0.1), jnp.asarray(0.3))
 FLAT = Plane(jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros((4, 3)))
-FITTED_TO = 2048
+FITTED_TO, SCORED = 2048, 512
 PIXELS = 10 * FITTED_TO
-# Each point fitted to stands for ten pixels.
-WORTH = PIXELS_PER_POINT / 10
+# Each point fitted to stands for ten pixels, each one that scores are counted from for forty.
+WORTH, SCORE_WORTH = PIXELS_PER_POINT / 10, PIXELS_PER_POINT / 40
 
 
 def told(scores, body=BODY, pixels=PIXELS, guards=()):
     """A shape with these scores, in nats of independent points, as it comes back."""
-    worth = max(1, PIXELS_PER_POINT * min(pixels, FITTED_TO) / pixels)
+    worth = max(1, PIXELS_PER_POINT * min(pixels, SCORED) / pixels)
     passed = sorted(s for k, s in scores.items() if not any(g.startswith(k) for g in guards))
     shape = dataclasses.replace(
         fitted_shape(body, np.ones(pixels, bool), 0.01),
@@ -32,7 +32,7 @@ def told(scores, body=BODY, pixels=PIXELS, guards=()):
         covariance=jnp.eye(2),
         guards=guards,
     )
-    return with_correlated_errors([shape], FITTED_TO)[0]
+    return told_apart(in_independent_points([shape], FITTED_TO))[0]
 
 
 def test_scores_margin_and_covariance_are_those_of_independent_points():
@@ -68,7 +68,7 @@ def test_another_family_that_is_as_likely_refuses():
 
 
 def test_the_bonus_of_planes_is_no_evidence():
-    bonus = PLANE_BONUS / WORTH
+    bonus = PLANE_BONUS / SCORE_WORTH
     assert told({"plane": TELLS / 2 - bonus, "cylinder": 0.0}).kind == "unknown"
     assert told({"plane": 2 * TELLS - bonus, "cylinder": 0.0}).kind == "cylinder"
     assert told({"plane": 0.0, "cylinder": bonus + TELLS / 2}, body=FLAT).kind == "unknown"
@@ -87,12 +87,12 @@ def test_a_surface_that_holds_few_of_its_points_is_refused():
     for share, kind in ((HOLDS - 0.01, "unknown"), (HOLDS + 0.01, "cylinder")):
         shape = fitted_shape(BODY, np.arange(PIXELS) < share * PIXELS, 0.01)
         shape = dataclasses.replace(shape, scores={"plane": 1e3, "cylinder": 0.0}, margin=1e3)
-        assert with_correlated_errors([shape], FITTED_TO)[0].kind == kind
+        assert told_apart([shape])[0].kind == kind
 
 
 def test_what_has_no_name_keeps_none():
     shape = fitted_shape(None, np.zeros(50, bool), 0.01)
-    same = with_correlated_errors([shape], FITTED_TO)[0]
+    same = told_apart(in_independent_points([shape], FITTED_TO))[0]
     assert same.kind == "unknown"
     assert int(same.status) == 0
     assert same.guards == ()
