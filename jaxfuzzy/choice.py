@@ -22,6 +22,8 @@ PLANE_BONUS = 20.0
 FLATTEST = 3.0
 # Of the inliers of a box, so many must lie on each of its faces.
 LEAST_FACE = 0.035
+# A cone narrows by so much a unit of height at least, and at most.
+SLOPES = (0.06, 2.2)
 # A point is on one face alone where others are so many deviations away.
 CLEAR = 3.0
 
@@ -84,14 +86,14 @@ def gric(square: Array, mask: Array, parameters: Array) -> Array:
 
 
 def cone_tapers(theta: Array, own: Array, height: Array) -> Array:
-    """A cone must narrow by a quarter over its inliers, and by more than 0.06 and less than 2.2 a unit of height."""
+    """A cone must narrow by a quarter over its inliers, and by a slope that is allowed."""
     total = own.sum(-1) + 1e-9
     mean = (own * height).sum(-1) / total
     spread = 1.7 * jnp.sqrt(jnp.maximum((own * (height - mean[:, None]) ** 2).sum(-1) / total, 1e-12))
     low, high = (theta[:, 2] - theta[:, 3] * (mean + side * spread) for side in (-1, 1))
     ratio = jnp.minimum(low, high) / jnp.maximum(jnp.maximum(low, high), 1e-6)
     slope = jnp.abs(theta[:, 3])
-    return (ratio < 0.75) & (slope > 0.06) & (slope < 2.2)
+    return (ratio < 0.75) & (slope > SLOPES[0]) & (slope < SLOPES[1])
 
 
 def faces_hold(theta: Array, signs: Array, part: Array, ownership: Array, background: Array, view: View) -> Array:

@@ -4,7 +4,8 @@ Places alone cannot tell: the inner wall of a vessel stands apart from the outer
 bodies that touch are one group. Two bodies cannot fill the same space, so what lies inside a round body is part of it, its inner
 wall or floor. For the rest a joint fit tells: where one surface holds nearly as many points of two groups as a surface each
 does, it needs half the parameters and they are one object; where two surfaces hold clearly more points of a group than one, they
-are two.
+are two. And what the surface of a group leaves over is looked at by places once more: a part of it that a surface of its own holds
+is an object beside the first.
 """
 
 import dataclasses
@@ -22,6 +23,8 @@ from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
 
 Fit = Callable[[Sequence[np.ndarray]], tuple[Shape, ...]]
+# Labels by places of the points with these indices.
+Parted = Callable[[np.ndarray], np.ndarray]
 
 # Of a group that is part of a round body, this share lies inside it, or outside by so many noise distances; so does this share
 # of the body's own group, of which the second share at least must lie on its surface.
@@ -48,6 +51,7 @@ def by_shapes(
     parts: Segmentation,
     shapes: tuple[Shape, ...],
     fit: Fit,
+    parted: Parted,
     camera: np.ndarray | None = None,
 ) -> tuple[Segmentation, tuple[Shape, ...]]:
     """Merges and divides groups where their shapes say so.
@@ -58,6 +62,7 @@ def by_shapes(
         parts: Their division by places.
         shapes: The shape of each group.
         fit: Fits shapes to sets of points given by their indices.
+        parted: Divides points given by their indices by places: labels 0, 1, ..., -1 for none.
         camera: Where the points were seen from (3,).
 
     Returns:
@@ -69,6 +74,7 @@ def by_shapes(
     joined = _joined(points, flat, members, shapes, fit, camera)
     taken = gathered.union(*joined)
     divided = _divided(points, flat, members, shapes, taken, fit)
+    divided |= _peeled(points, members, shapes, taken.union(divided), fit, parted)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []
@@ -289,6 +295,32 @@ def _divided(
             near = np.minimum(*away) <= max(float(shape.noise_distance) for shape, _ in named)
             side[k] = np.where(near, np.argmin(away, axis=0), side[k])
     return good
+
+
+def _peeled(
+    points: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    taken: set[int],
+    fit: Fit,
+    parted: Parted,
+) -> dict[int, list[tuple[np.ndarray, Shape]]]:
+    """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these."""
+    left: list[tuple[int, np.ndarray]] = []
+    for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
+        rest, least = own[~np.asarray(shape.inliers)], max(FEWEST, SMALLEST * len(own))
+        if k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
+            labels = parted(rest)
+            pieces = [rest[labels == i] for i in range(labels.max(initial=-1) + 1)]
+            left += [(k, piece) for piece in pieces if len(piece) >= least]
+    others: dict[int, list[tuple[np.ndarray, Shape]]] = {}
+    for (k, piece), shape in zip(left, fit([piece for _, piece in left]) if left else (), strict=True):
+        whole = shape.primitive is not None and _held(shape) >= WHOLE * len(piece)
+        if whole and not _contained(points, [members[k], piece], [shapes[k], shape]):
+            others.setdefault(k, []).append((piece, shape))
+    stay = {k: np.setdiff1d(members[k], np.concatenate([piece for piece, _ in of])) for k, of in others.items()}
+    anew = fit(list(stay.values())) if stay else ()
+    return {k: [(stay[k], shape), *others[k]] for k, shape in zip(stay, anew, strict=True)}
 
 
 def _side(flat: np.ndarray) -> np.ndarray:

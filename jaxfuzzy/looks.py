@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxfuzzy.choice import SLOPES
 from jaxfuzzy.fitting import Fitted, fit_batch
 from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, prepared, stacked, with_more
 from jaxfuzzy.search import KINDS, MORE
@@ -189,7 +190,19 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
     # Batches of one compiled size, side by side on the processors there are; two each, since some take longer than others.
     workers = os.cpu_count() or 1
     with threads(workers) as pool:
-        return [found for batch in pool.map(fit, batches(range(len(items)), 2 * workers)) for found in batch]
+        looks = [found for batch in pool.map(fit, batches(range(len(items)), 2 * workers)) for found in batch]
+    # A cone that the last polish took all narrowing from is none.
+    straight = [i for i, found in enumerate(looks) if _straight(found)]
+    others = settings._replace(kinds=tuple(k for k in settings.kinds if k != "cone"))
+    again = _search([items[i] for i in straight], others, [looks[i].expected for i in straight])
+    for i, found in zip(straight, again, strict=True):
+        looks[i] = found
+    return looks
+
+
+def _straight(look: Look) -> bool:
+    p = look.fitted.polished
+    return KINDS[look.fitted.kind] == "cone" and bool(look.fitted.passed.any()) and not SLOPES[0] < abs(p.theta[3])
 
 
 def _reason(look: Look) -> Status:

@@ -255,13 +255,16 @@ def _model(
             found = fitted(sets)
             return found if sight is None else without_seen_through(points, [own[m] for m in sets], found, sight)
 
+        def parted(of: np.ndarray) -> np.ndarray:
+            return np.asarray(segment(places[of], **seen(own[of])).labels)
+
         def as_kind(of: Sequence[int], kind: str) -> tuple[Shape, ...]:
             return in_independent_points(fitted([members[i] for i in of], kinds=(kind,)), OF_SCENE)
 
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
             across = np.asarray(tangents(jnp.asarray(vertical)))
-            parts, shapes = by_shapes(places, across, parts, shapes, fit, eye)
+            parts, shapes = by_shapes(places, across, parts, shapes, fit, parted, eye)
             members = members_of(parts)
         correlated = cloud.pixels_px is not None and shape_rule != "paper"
         if correlated:

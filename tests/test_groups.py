@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfuzzy.groups import _seen_from, _way_hidden, by_shapes
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
@@ -33,6 +34,11 @@ def fitted_to(points, bodies):
     return fit
 
 
+def by_places(points):
+    """Divides some of the points by places."""
+    return lambda some: np.asarray(segment(points[some]).labels)
+
+
 def divided(points, labels):
     """A division by places, relabelled as asked."""
     parts = segment(points, ks=(int(labels.max()) + 1,))
@@ -55,7 +61,7 @@ def test_two_parts_of_one_ball_are_merged_and_a_stranger_is_not():
     parts = divided(points, np.array([0, 1, 2]))
     fit = fitted_to(points, [Sphere(jnp.array([0, 0, 1.0]), jnp.asarray(0.15)), Sphere(jnp.array([0.6, 0, 1.0]), 0.05)])
     members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)]
-    merged, shapes = by_shapes(points, ACROSS, parts, fit(members), fit)
+    merged, shapes = by_shapes(points, ACROSS, parts, fit(members), fit, by_places(points))
     assert merged.k == len(shapes) == 2
     labels = np.asarray(merged.labels)
     assert len(set(labels[: len(cut)]) - {-1}) == 1
@@ -71,7 +77,7 @@ def test_two_balls_that_touch_are_told_apart():
     spheres = [Sphere(jnp.array([x, 0, 1.0]), jnp.asarray(0.1)) for x in (0.0, 0.2)]
     fit = fitted_to(points, spheres)
     one = fit([np.flatnonzero(np.asarray(parts.labels) == 0)])
-    apart, shapes = by_shapes(points, ACROSS, parts, one, fit)
+    apart, shapes = by_shapes(points, ACROSS, parts, one, fit, by_places(points))
     assert apart.k == len(shapes) == 2
     labels = np.asarray(apart.labels)
     np.testing.assert_array_equal(hardened(apart), labels)
@@ -79,8 +85,28 @@ def test_two_balls_that_touch_are_told_apart():
     # A group that one surface holds stays whole.
     alone = segment(points[:300], ks=(1,))
     held = fit([np.flatnonzero(np.asarray(alone.labels) == 0)])
-    same, _ = by_shapes(points[:300], ACROSS, alone, held, fit)
+    same, _ = by_shapes(points[:300], ACROSS, alone, held, fit, by_places(points))
     assert same is alone
+
+
+def test_what_a_body_leaves_over_is_an_object_where_a_surface_holds_it():
+    # A large ball, and two small ones so near that the three are one group; of one of these only half is on its surface.
+    rng = np.random.default_rng(2)
+    places = [[0, 0, 1.0], [0.155, 0, 1.0], [-0.155, 0, 1.0]]
+    fuzz = rng.uniform(-0.03, 0.03, (120, 3)) + [-0.155, 0, 1.0]
+    points = np.concatenate([ball(places[0], 0.1, 700), ball(places[1], 0.04, 200), ball(places[2], 0.04, 90), fuzz])
+    fit = fitted_to(
+        points, [Sphere(jnp.array(p), jnp.asarray(r)) for p, r in zip(places, (0.1, 0.04, 0.04), strict=True)]
+    )
+    parts = segment(points, ks=(1,))
+    members = np.flatnonzero(np.asarray(parts.labels) == 0)
+    apart, shapes = by_shapes(points, ACROSS, parts, fit([members]), fit, by_places(points))
+    labels = np.asarray(apart.labels)
+    np.testing.assert_array_equal(hardened(apart), labels)
+    assert [float(shape.primitive.radius) for shape in shapes] == pytest.approx([0.1, 0.04])
+    assert (labels[700:900] == 1).mean() > 0.95
+    assert not (labels[900:] == 1).any()
+    assert [len(shape.inliers) for shape in shapes] == [(labels == k).sum() for k in (0, 1)]
 
 
 def wall(radius, toward, count=500, seed=0):
@@ -107,7 +133,7 @@ def test_what_lies_inside_a_round_body_is_part_of_it():
     parts = divided(points, np.array([0, 1, 2]))
     fit = fitted_to(points, bodies)
     members = [np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)]
-    merged, shapes = by_shapes(points, ACROSS, parts, fit(members), fit)
+    merged, shapes = by_shapes(points, ACROSS, parts, fit(members), fit, by_places(points))
     assert merged.k == 2
     labels = np.asarray(merged.labels)
     assert len(set(labels[:1000]) - {-1}) == 1
@@ -122,7 +148,9 @@ def test_a_vessel_in_one_group_is_not_divided():
     points, bodies = vessel()
     parts = segment(points, ks=(1,))
     fit = fitted_to(points, bodies)
-    same, _ = by_shapes(points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)]), fit)
+    same, _ = by_shapes(
+        points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)]), fit, by_places(points)
+    )
     assert same is parts
 
 
@@ -141,8 +169,8 @@ def test_halves_far_apart_are_merged_where_something_hides_what_is_between():
     shapes = fit([np.flatnonzero(np.asarray(parts.labels) == k) for k in range(3)])
     # Without a camera, or with one that sees between them, they are too far apart to be tried.
     for camera in (None, np.array([0, 5.0, 1.0])):
-        assert by_shapes(points, ACROSS, parts, shapes, fit, camera)[0] is parts
-    merged, found = by_shapes(points, ACROSS, parts, shapes, fit, np.zeros(3))
+        assert by_shapes(points, ACROSS, parts, shapes, fit, by_places(points), camera)[0] is parts
+    merged, found = by_shapes(points, ACROSS, parts, shapes, fit, by_places(points), np.zeros(3))
     assert merged.k == len(found) == 2
 
 

@@ -348,6 +348,24 @@ def test_threads_compute_in_the_precision_of_the_one_that_asks(double):
         assert pool.submit(lambda: jnp.ones(1).dtype).result() == jnp.ones(1).dtype
 
 
+@pytest.mark.parametrize(("slope", "kind"), [(0.01, "cylinder"), (0.2, "cone")])
+def test_a_cone_that_the_last_polish_made_straight_is_none(slope, kind, monkeypatch):
+    search = looks.fit_batch
+
+    def cones_first(batch, allowed, *options):
+        fitted = search(batch, allowed, *options)
+        if not allowed[3]:
+            return fitted
+        theta = fitted.polished.theta.at[:, 3].set(slope)
+        return fitted._replace(kind=jnp.full_like(fitted.kind, 3), polished=fitted.polished._replace(theta=theta))
+
+    made = simulate_object("cylinder", 3, points=(900, 901))
+    monkeypatch.setattr(looks, "fit_batch", cones_first)
+    shape = fit_shape(made.points, camera=made.camera, noise_distance=2.5 * made.depth_std)
+    assert shape.kind == kind
+    assert kind == "cone" or any(guard.startswith("cone: it does not taper") for guard in shape.guards)
+
+
 def test_an_axis_is_square_to_most_normals_though_a_third_are_of_edges():
     rng = np.random.default_rng(0)
     truth = np.array([0.6, 0.0, 0.8])
