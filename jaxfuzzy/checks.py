@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.arrays import Array, as_float, is_concrete
+from jaxfuzzy.arrays import Array, as_float, extents, is_concrete
 
 # Of scenes, in the unit of the points: from a tenth of a nanometre to beyond the moon, were it metres.
 SMALLEST, FARTHEST = 1e-10, 1e9
@@ -39,7 +39,7 @@ def places(value: Any, name: str = "points") -> Array:
     array = points(value, name, dims=3)
     if is_concrete(array):
         known = np.asarray(array)
-        largest, extent = float(np.abs(known).max()), float(np.ptp(known, axis=0).max())
+        largest, extent = float(np.abs(known).max()), float(extents(known).max())
         if largest > FARTHEST or 0 < extent < SMALLEST:
             raise ValueError(
                 f"{name} must lie within {FARTHEST:g} of the origin and extend over at least {SMALLEST:g}, got {largest:g} and"

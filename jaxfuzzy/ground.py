@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, record
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, lengths, record
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.planes import (
     POINT_DELTA,
@@ -282,7 +282,7 @@ def _deviation(
     middle = np.median(x[w > 0], axis=0)
     # Points that are all equal have no spread; rounding is the least noise there is.
     least = np.finfo(x.dtype).eps * max(float(np.abs(x).max()), np.finfo(x.dtype).tiny)
-    spread = max(float(np.median(np.linalg.norm(x[w > 0] - middle, axis=1))), least)
+    spread = max(float(np.median(lengths(x[w > 0] - middle))), least)
     if eye is None:
         return np.full(len(x), spread, x.dtype), False
     # A stereo match is wrong by so many pixels: its depth by the square of the distance.

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import lengths
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.primitives import Cone, Cylinder, Primitive, Sphere
@@ -29,6 +30,8 @@ Parted = Callable[[np.ndarray], np.ndarray]
 # Of a group that is part of a round body, this share lies inside it, or outside by so many noise distances; so does this share
 # of the body's own group, of which the second share at least must lie on its surface.
 INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
+# So many of its points, and less than twice as many, say whether it does.
+ASKED = 2048
 # Only neighbours are tried together: centers nearer than this share of the sum of their reaches, or than the second one where
 # something hides most of so many stops on the way between them that are on neither; and so many pairs at most.
 NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 12, 16
@@ -124,12 +127,13 @@ def _gathered(
 def _contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequence[Shape]) -> dict[int, int]:
     """Which groups lie inside the round body of another, and of which."""
     into: dict[int, int] = {}
+    some = [points[own[:: max(1, len(own) // ASKED)]] for own in members]
     # Of two that lie inside each other the one whose surface holds more points is the body.
     for a in sorted(range(len(members)), key=lambda k: -_held(shapes[k])):
         if a in into or _held(shapes[a]) < SURFACE * len(members[a]):
             continue
         slack = SLACK * float(shapes[a].noise_distance)
-        inside = [len(own) > 0 and _inside(shapes[a].primitive, points[own], slack).mean() >= INSIDE for own in members]
+        inside = [len(own) > 0 and _inside(shapes[a].primitive, own, slack).mean() >= INSIDE for own in some]
         for b in range(len(members)):
             # A group that holds others is no part itself.
             if inside[a] and inside[b] and b != a and b not in into and b not in into.values():
@@ -140,7 +144,7 @@ def _contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequen
 def _inside(body: Primitive | None, points: np.ndarray, slack: float) -> np.ndarray:
     """Which points lie inside a round body, or outside by no more than the slack."""
     if isinstance(body, Sphere):
-        return np.asarray(np.linalg.norm(points - np.asarray(body.center), axis=1) <= float(body.radius) + slack)
+        return np.asarray(lengths(points - np.asarray(body.center)) <= float(body.radius) + slack)
     if isinstance(body, Cylinder):
         start, low, high, radius, slope = body.base, 0.0, float(body.height), float(body.radius), 0.0
     elif isinstance(body, Cone):
@@ -150,7 +154,7 @@ def _inside(body: Primitive | None, points: np.ndarray, slack: float) -> np.ndar
         return np.zeros(len(points), bool)
     offset, axis = points - np.asarray(start), np.asarray(body.axis)
     along = offset @ axis
-    across = np.linalg.norm(offset - along[:, None] * axis, axis=1)
+    across = lengths(offset - along[:, None] * axis)
     within = (along >= low - slack) & (along <= high + slack)
     return np.asarray(within & (across <= radius + slope * along + slack))
 
@@ -170,7 +174,7 @@ def _joined(
     """Pairs of groups that one surface holds, and that surface; each group is in one pair at most."""
     able = [k for k, own in enumerate(members) if len(own) >= FEWEST]
     middle = {k: np.median(flat[members[k]], axis=0) for k in able}
-    reach = {k: np.quantile(np.linalg.norm(flat[members[k]] - middle[k], axis=1), 0.9) for k in able}
+    reach = {k: np.quantile(lengths(flat[members[k]] - middle[k]), 0.9) for k in able}
     apart = {
         (a, b): np.linalg.norm(middle[a] - middle[b]) / max(reach[a] + reach[b], 1e-12)
         for a in able
@@ -221,7 +225,7 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, members: Sequence[np.ndar
     some = [own[::step] for own in members]
     offset = [points[own] - camera for own in some]
     every = np.concatenate(offset)
-    depth = np.linalg.norm(every, axis=1)
+    depth = lengths(every)
     return View(
         np.stack([np.median(o, axis=0) if len(o) else np.zeros(3) for o in offset]),
         every / np.maximum(depth, 1e-12)[:, None],
@@ -348,17 +352,18 @@ def _rebuilt(
     columns, size, centers, spare = [], [], [], np.zeros(len(points), u.dtype)
     for i, (own, _, k) in enumerate(groups):
         sources = [k, *(b for b, a in into.items() if a == k)]
-        most, total = u[:, sources].max(axis=1), u[:, sources].sum(axis=1)
-        # Memberships add up for the points of a merged group; what that would give others stays where they belong.
-        column = np.where(labels == i, total, most)
+        column = u[:, k]
+        if len(sources) > 1:
+            # Memberships add up for the points of a merged group; what that would give others stays where they belong.
+            most, total, mine = u[:, sources].max(axis=1), u[:, sources].sum(axis=1), labels == i
+            column = np.where(mine, total, most)
+            spare += np.where(mine, 0, total - most)
         siblings = [j for j, (_, _, other) in enumerate(groups) if other == k]
         share = 1.0
         if len(siblings) > 1:
             # What has no label of its own stays with the first.
             column = np.where(np.isin(labels, siblings), column * (labels == i), column * (i == siblings[0]))
             share = len(own) / sum(len(groups[j][0]) for j in siblings)
-        else:
-            spare += np.where(labels == i, 0, total - most)
         columns.append(column)
         size.append(share * sizes[sources].sum())
         centers.append(points[own].mean(axis=0))

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfuzzy.arrays import lengths
+
 # A noise distance is so many standard deviations; residuals are searched and weighed in deviations.
 DEVIATIONS = 2.5
 # Sizes that are compiled: points an object and objects a batch; an object that is not there costs nothing.
@@ -86,30 +88,31 @@ def prepared(
     if camera is not None and (camera - middle) @ up < 0:
         up = -up
     turn = upright(up, np.zeros(3) if camera is None else middle - camera)
-    offset = (p - middle) @ turn.T
-    scatter = (offset * share[:, None]).T @ offset
+    q = (p - middle) @ turn.T
+    scatter = (q * share[:, None]).T @ q
     unit = float(np.sqrt(np.trace(scatter)))
-    q = offset / (unit if unit > 0 else 1.0)
+    q /= unit if unit > 0 else 1.0
     order = fair_order(q)
     if not share.all():  # weight 0 last
         order = order[np.argsort(share[order] == 0, kind="stable")]
+    q, weight, share = q.take(order, axis=0), weight[order], share[order]
     eye, depth, ray, relative = np.zeros(3), q[:, 2], np.zeros_like(q), np.ones(len(p))
     if along_ray and camera is not None:
         eye = turn @ (camera - middle) / (unit if unit > 0 else 1.0)
         ray = q - eye
-        depth = np.sqrt(np.einsum("ij,ij->i", ray, ray))
-        ray = ray / np.maximum(depth, 1e-12)[:, None]
+        depth = lengths(ray)
+        ray /= np.maximum(depth, 1e-12)[:, None]
         # Without a better word the deviation of stereo grows with the square of the distance.
         relative = (depth / (share @ depth)) ** 2
-    gain = 1 / (relative if deviation is None else deviation / (unit if unit > 0 else 1.0))
+    gain = 1 / (relative if deviation is None else deviation[order] / (unit if unit > 0 else 1.0))
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter), 0))
     return Prepared(
-        points=q[order],
-        rays=ray[order],
+        points=q,
+        rays=ray,
         order=order,
-        gain=gain[order],
+        gain=gain,
         typical=float(np.median(1 / gain)),
-        weight=weight[order],
+        weight=weight,
         eye=eye,
         depth_range=max(float(np.ptp(depth)), 1e-6),
         given=deviation is not None,
@@ -145,7 +148,7 @@ def with_more(
     ray = np.zeros_like(q)
     if along_ray:
         ray = q - item.eye
-        ray = ray / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)[:, None]
+        ray = ray / np.maximum(lengths(ray), 1e-12)[:, None]
     join = lambda a, b: np.concatenate([a, b])
     gain = join(item.gain, unit / deviation)
     return item._replace(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import lengths
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -129,7 +130,7 @@ def _rests(end: End, ground: Plane | None, thickness: float) -> bool:
 def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Directions and distances of a fair share of some points."""
     offset = np.asarray(points[own[:: -(-len(own) // LOOKED_AT) or 1]] - camera, float)
-    depth = np.linalg.norm(offset, axis=1)
+    depth = lengths(offset)
     return offset / np.maximum(depth, 1e-12)[:, None], depth
 
 
@@ -159,11 +160,11 @@ def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camer
         # The surface as far beyond its end as half the strip is wide, or as the other's points tell where it ends.
         step = np.maximum(inside[asked], 0) + max(width / 2, 0.7 * reach * away)
         beyond = _moved(shape.primitive, surface[asked], end, step, camera)
-        far = np.linalg.norm(beyond, axis=1)
+        far = lengths(beyond)
         view = beyond / far[:, None]
         middle = view.mean(axis=0)
         middle = middle / np.linalg.norm(middle)
-        wide = np.linalg.norm(view - middle, axis=1).max() + reach
+        wide = lengths(view - middle).max() + reach
         near = 2 - 2 * other.ray @ middle < wide**2
         close = 2 - 2 * view @ other.ray[near].T < reach**2
         in_front = other.depth[near] < far[:, None] - CLEARLY * float(shape.noise_distance)

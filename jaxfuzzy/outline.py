@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import lengths
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
@@ -65,7 +66,7 @@ def sight_of(points: np.ndarray, loose: np.ndarray, camera: np.ndarray, up: np.n
     """
     which = slice(None, None, max(1, len(points) // LOOKED_AT))
     offset = np.asarray(points[which] - camera, float)
-    depth = np.linalg.norm(offset, axis=1)
+    depth = lengths(offset)
     return Sight(camera, up, which, offset / np.maximum(depth, 1e-12)[:, None], depth, loose[which])
 
 
@@ -122,7 +123,7 @@ def _through(body: Primitive, noise_distance: float, held: np.ndarray, mine: np.
     hit = _hits(body, held, sight)
     met = np.flatnonzero(np.isfinite(hit))
     hit, depth = hit[met], sight.depth[met]
-    away = np.median(np.linalg.norm(held - sight.camera, axis=1))
+    away = np.median(lengths(held - sight.camera))
     slack = CLEARLY * noise_distance * (hit / away) ** 2
     on = np.abs(depth - hit) <= slack
     # An object's own points behind its surface are the inside of a vessel, or its other side.
@@ -150,7 +151,7 @@ def _hits(body: Primitive, held: np.ndarray, sight: Sight) -> np.ndarray:
     hit = np.full(len(sight.rays), np.inf)
     if isinstance(body, Plane):
         middle = held.mean(axis=0)
-        reach = np.linalg.norm(held - middle, axis=1).max()
+        reach = lengths(held - middle).max()
         near = _near(sight, middle, reach)
         hit[near] = _hits_of_plane(body, held - sight.camera, sight.rays[near], sight.camera)
     elif _extended(body):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxfuzzy.arrays import extents
 from jaxfuzzy.primitives import Plane, Quadric
 from jaxfuzzy.shapes import Shape, refused
 from jaxfuzzy.status import Status
@@ -41,7 +42,7 @@ def without_pieces(
         members: Indices of the points of each shape.
         shapes: The shapes.
     """
-    extent = np.ptp(pixels, axis=0) + 1
+    extent = extents(pixels) + 1
     if not extent.prod() <= SPARSE * len(pixels):
         return tuple(shapes)
     column, row = np.round(pixels - pixels.min(axis=0)).astype(int).T + STEP

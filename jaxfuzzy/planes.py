@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfuzzy.arrays import Array, Bool, Float, Int, record
+from jaxfuzzy.arrays import Array, Bool, Float, Int, lengths, record
 from jaxfuzzy.linalg import tangents
 
 # Patches along each side of the view. 24 leaves a patch of a 450 x 375 image some 19 x 16 pixels: over that, a standing
@@ -284,7 +284,7 @@ def noise_of(x: np.ndarray, std: np.ndarray, eye: np.ndarray | None) -> tuple[np
     if eye is None:
         return np.zeros_like(x), std
     ray = x - eye
-    ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), np.finfo(x.dtype).tiny)
+    ray = ray / np.maximum(lengths(ray)[:, None], np.finfo(x.dtype).tiny)
     return ray * std[:, None], SIDEWAYS * std
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, Float, Int, record, static
+from jaxfuzzy.arrays import Array, Float, Int, lengths, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import in_independent_points, told_apart
 from jaxfuzzy.ground import fit_ground, foreground
@@ -275,7 +275,7 @@ def _model(
                 shapes = chosen_by_outline(points, mine, shapes, sight, as_kind)
             shapes = without_seen_through(points, mine, shapes, sight)
             if correlated:
-                depth = np.linalg.norm(points - eye, axis=1)
+                depth = lengths(points - eye)
                 shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, mine, shapes)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:

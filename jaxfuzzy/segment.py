@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, record
+from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, record
 from jaxfuzzy.density import DELTA, PROTOTYPES, SWEEPS, part
 from jaxfuzzy.fcm import Partition, fcm
 from jaxfuzzy.linalg import tangents
@@ -110,7 +110,7 @@ def segment(
 
 def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[int, ...], noise: float) -> Segmentation:
     # A noise distance beyond the cloud's own extent says no more than that extent, and may overflow when squared.
-    bandwidth = max(_bandwidth(x, w), min(noise, float(np.linalg.norm(np.ptp(x, axis=0)))))
+    bandwidth = max(_bandwidth(x, w), min(noise, float(np.linalg.norm(extents(x)))))
     # The plane in its own frame, so that shifts and turns of the cloud change nothing.
     flat = (x - np.average(x, axis=0, weights=w)) @ axes.T
     turn = np.linalg.eigh((flat * w[:, None]).T @ flat)[1]

@@ -89,8 +89,10 @@ def test_of_the_paper_cones_nothing_is_named_wrongly(shared_data):
     kinds = [shape.kind for shape in scene.shapes]
     assert kinds.count("cone") >= 4
     assert kinds.count("cylinder") == 1
-    assert set(kinds) <= {"cone", "cylinder", "quadric", "unknown"}
+    assert kinds.count("plane") == 1
+    assert set(kinds) <= {"cone", "cylinder", "plane", "quadric", "unknown"}
     assert at(395, 320).kind == "cylinder"  # the mug
+    assert at(340, 340).kind == "plane"  # the front of a box of matches that touches it
     wall = at(160, 70)
     assert wall.kind == "unknown"
     assert jf.Status(int(wall.status)) & jf.Status.PIECE
