@@ -5,10 +5,10 @@ nothing of kinds, say it is.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -51,6 +51,10 @@ UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
 APART, SLANT, AGREE = 0.3, 0.1, 0.65
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
+
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 class Settings(NamedTuple):
@@ -172,6 +176,12 @@ def threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, initializer=enter)
 
 
+def side_by_side(work: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """What work makes of each item, as many at a time as there are processors."""
+    with threads(os.cpu_count() or 1) as pool:
+        return list(pool.map(work, items))
+
+
 def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[float] = ()) -> list[Look]:
     if not items:
         return []
@@ -187,10 +197,9 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
         unread = Look(items[i], fitted, noise, Status(0))
         return unread._replace(reason=_reason(unread))
 
-    # Batches of one compiled size, side by side on the processors there are; two each, since some take longer than others.
-    workers = os.cpu_count() or 1
-    with threads(workers) as pool:
-        looks = [found for batch in pool.map(fit, batches(range(len(items)), 2 * workers)) for found in batch]
+    # Batches of one compiled size; two for each processor, since some take longer than others.
+    few = batches(range(len(items)), 2 * (os.cpu_count() or 1))
+    looks = [found for batch in side_by_side(fit, few) for found in batch]
     # A cone that the last polish took all narrowing from is none.
     straight = [i for i, found in enumerate(looks) if _straight(found)]
     others = settings._replace(kinds=tuple(k for k in settings.kinds if k != "cone"))

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxfuzzy.arrays import lengths
 from jaxfuzzy.linalg import tangents
+from jaxfuzzy.looks import side_by_side
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Shape, refused
@@ -81,12 +82,14 @@ def without_seen_through(
         shapes: The shapes.
         sight: What the camera sees.
     """
-    return tuple(
-        refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
-        if seen_through(points, own, shape, sight).share > THROUGH
-        else shape
-        for own, shape in zip(members, shapes, strict=True)
-    )
+
+    def told(of: tuple[np.ndarray, Shape]) -> Shape:
+        own, shape = of
+        if seen_through(points, own, shape, sight).share <= THROUGH:
+            return shape
+        return refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
+
+    return tuple(side_by_side(told, zip(members, shapes, strict=True)))
 
 
 class Through(NamedTuple):

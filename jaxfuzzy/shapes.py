@@ -5,7 +5,6 @@ known: stereo errs along the ray alone, so a surface should predict one depth a 
 """
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -16,9 +15,9 @@ import numpy as np
 from jaxfuzzy import bounds, checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
 from jaxfuzzy.fitting import TOLERANCES, Fitted, Judged, assemble_batch, judged
-from jaxfuzzy.looks import Look, Settings, look_at, threads, unfit
+from jaxfuzzy.looks import Look, Settings, look_at, side_by_side, unfit
 from jaxfuzzy.mostpoints import most_points
-from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, batches, capacity_for, prepared
+from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, Prepared, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.quadrics import quadric_of
 from jaxfuzzy.search import KINDS
@@ -209,12 +208,12 @@ def fit_members(
     p = np.asarray(array, float)
     w = np.ones(count) if weight is None else np.asarray(weight, float)
     along_ray = distance == "ray" or (rule == "paper" and eye is not None)
-    objects = [
-        prepared(p[m], w[m], None if delta is None else delta[m] / DEVIATIONS, vertical, eye, along_ray)
-        if len(m)
-        else None
-        for m in members
-    ]
+
+    def ready(m: np.ndarray) -> Prepared | None:
+        own = None if delta is None else delta[m] / DEVIATIONS
+        return prepared(p[m], w[m], own, vertical, eye, along_ray) if len(m) else None
+
+    objects = side_by_side(ready, members)
     poor = [unfit(o) for o in objects]
     good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
     most = max((len(o.points) for o in good), default=1)
@@ -326,17 +325,21 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
     """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
     good = {i: look for i, look in looks.items() if not look.reason}
-    seen = {i: judged(look.item, look.fitted, settings.along_ray) for i, look in good.items()}
+    judge = lambda look: judged(look.item, look.fitted, settings.along_ray)
+    seen = dict(zip(good, side_by_side(judge, good.values()), strict=True))
     same = {kind: [i for i, o in good.items() if KINDS[o.fitted.kind] == kind] for kind in KINDS}
     parts = [(kind, part) for kind, own in same.items() for part in batches(own)]
-    surfaces = [(kind, *_surfaces([good[i] for i in part], [seen[i] for i in part], settings)) for kind, part in parts]
+
+    def surfaces(part: tuple[str, Sequence[int]]) -> Any:
+        kind, own = part
+        return jax.device_get(
+            assemble_batch(kind, *_surfaces([good[i] for i in own], [seen[i] for i in own], settings))
+        )
+
     made: dict[int, tuple[Primitive, np.ndarray]] = {}
-    # Side by side for the sake of the first call, which compiles every kind.
-    with threads(os.cpu_count() or 1) as pool:
-        for (_, part), found in zip(
-            parts, pool.map(lambda s: jax.device_get(assemble_batch(*s)), surfaces), strict=True
-        ):
-            made |= {i: jax.tree.map(lambda a, j=j: a[j], found) for j, i in enumerate(part)}
+    # Every kind is compiled in the first call, for the sake of which they are made side by side too.
+    for (_, part), found in zip(parts, side_by_side(surfaces, parts), strict=True):
+        made |= {i: jax.tree.map(lambda a, j=j: a[j], found) for j, i in enumerate(part)}
     arrays, rest = [], []
     for i, size in enumerate(sizes):
         if i in made:
