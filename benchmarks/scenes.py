@@ -18,12 +18,13 @@ from common import RESULTS, provenance, table, timings, write
 import jaxfuzzy as jf
 from jaxfuzzy.render import Rendered, render_pair, table_scene
 
-# folder, left, right
+# folder, left, right; of lampshade1 the offset is not known, so that its lengths are in no unit and its shapes are bent
 PHOTOGRAPHS = {
     "cones": ("middlebury2003_cones", "im2.png", "im6.png"),
     "cones, full size": ("middlebury2003_cones_full", "im2.png", "im6.png"),
     "bowling1": ("middlebury2006_bowling1_half", "view1.png", "view5.png"),
     "art": ("middlebury2005_art", "view1.png", "view5.png"),
+    "lampshade1": ("middlebury2006_lampshade1_third", "view1.png", "view5.png"),
     "baby1": ("middlebury2006_baby1_half", "view1.png", "view5.png"),
     "books": ("middlebury2005_books", "view1.png", "view5.png"),
     "recycle": ("middlebury2014_recycle_quarter", "im0.png", "im1.png"),
@@ -38,6 +39,7 @@ PLACES = (
     ("cones", "green cone at the left", 120, 320, ("cone",)),
     ("cones", "red cone at the left", 78, 260, ("cone",)),
     ("cones", "white cone behind", 235, 120, ("cone",)),
+    ("cones", "box of matches", 340, 340, ("box", "plane")),
     ("bowling1", "ball", 250, 250, ("sphere",)),
     ("bowling1", "pins with cloth", 70, 250, ("unknown", "quadric")),
     ("art", "bust", 150, 110, ("unknown", "quadric")),
@@ -46,12 +48,20 @@ PLACES = (
     ("art", "cone", 230, 240, ("cone",)),
     ("art", "lying crayon", 213, 328, ("cylinder",)),
     ("art", "cup", 385, 310, ("cylinder", "cone")),
+    ("lampshade1", "panel", 242, 110, ("box", "plane")),
+    ("lampshade1", "carton", 360, 293, ("box", "plane")),
+    ("lampshade1", "notched block", 367, 147, ("box", "plane")),
+    ("lampshade1", "hat box", 44, 293, ("cylinder",)),
+    ("lampshade1", "cylinder on the hat box", 40, 176, ("cylinder",)),
+    ("lampshade1", "crumpled lampshade", 220, 293, ("unknown", "quadric", "cone")),
     ("baby1", "hat box", 300, 440, ("cylinder",)),
     ("baby1", "doll", 300, 240, ("unknown", "quadric")),
     ("recycle", "bin", 300, 300, ("box",)),
     ("jadeplant", "plant", 320, 120, ("unknown", "quadric")),
     ("jadeplant", "flower pot", 330, 350, ("cone",)),
     ("jadeplant", "carton at the left", 110, 340, ("box", "plane")),
+    ("adirondack", "mug", 364, 155, ("cylinder",)),
+    ("adirondack", "book at the left", 118, 254, ("box", "plane")),
 )
 BALL_RADIUS_MM = 203.7  # of a sphere fitted to the true disparities; lengths of this pair are nominal
 NEAR_PX = 6
@@ -62,6 +72,14 @@ def owner_at(scene: jf.Scene, column: float, row: float) -> int | None:
     pixels, labels = np.asarray(scene.cloud.pixels_px), np.asarray(scene.segmentation.labels)
     here = labels[(np.abs(pixels - [column, row]).max(axis=1) <= NEAR_PX) & (labels >= 0)]
     return int(np.bincount(here).argmax()) if len(here) else None
+
+
+def rig_of(data: Path, folder: str) -> jf.Rig:
+    """The cameras of a photograph; focal length and baseline alone, as its source tells them, where there is no file."""
+    path = data / folder / "calib.txt"
+    if path.exists():
+        return jf.load_rig(path)
+    return jf.Rig((3740 / 3, 3740 / 3), (216.0, 184.5), 0.16, (433, 370), max_disparity_px=80, metric=False)
 
 
 def sizes_of(kind: str, primitive: Any) -> dict[str, float]:
@@ -124,11 +142,13 @@ def photographs(data: Path) -> dict[str, Any]:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(3, 3, figsize=(13, 11), layout="constrained")
+    figure, axes = plt.subplots(4, 3, figsize=(13, 14.5), layout="constrained")
+    for ax in axes.flat[len(PHOTOGRAPHS) :]:
+        ax.set_axis_off()
     scenes: dict[str, jf.Scene] = {}
     results: dict[str, Any] = {}
-    for (name, (folder, left, right)), ax in zip(PHOTOGRAPHS.items(), axes.flat, strict=True):
-        rig = jf.load_rig(data / folder / "calib.txt")
+    for (name, (folder, left, right)), ax in zip(PHOTOGRAPHS.items(), axes.flat, strict=False):
+        rig = rig_of(data, folder)
         scene = scenes[name] = jf.model_scene(data / folder / left, data / folder / right, rig)
         jf.plot.overlay(scene.image, scene.shapes, scene.rig, ax=ax)
         ax.set_title(name)

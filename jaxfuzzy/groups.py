@@ -22,6 +22,7 @@ from jaxfuzzy.fitting import distances
 from jaxfuzzy.primitives import Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
+from jaxfuzzy.status import Status
 
 Fit = Callable[[Sequence[np.ndarray]], tuple[Shape, ...]]
 # Labels by places of the points with these indices.
@@ -76,7 +77,8 @@ def by_shapes(
     flat = points @ across.T
     joined = _joined(points, flat, members, shapes, fit, camera)
     taken = gathered.union(*joined)
-    divided = _divided(points, flat, members, shapes, taken, fit)
+    height = points @ np.cross(*across)
+    divided = _divided(points, flat, height[:, None], members, shapes, taken, fit)
     divided |= _peeled(points, members, shapes, taken.union(divided), fit, parted)
     if not joined and not divided:
         return parts, shapes
@@ -264,27 +266,31 @@ def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Sha
 def _divided(
     points: np.ndarray,
     flat: np.ndarray,
+    height: np.ndarray,
     members: Sequence[np.ndarray],
     shapes: Sequence[Shape],
     taken: set[int],
     fit: Fit,
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups that two surfaces hold much better than one, and these."""
-    tried = {
-        k: own
+    able = [
+        k
         for k, (own, shape) in enumerate(zip(members, shapes, strict=True))
         if k not in taken and len(own) >= 2 * FEWEST and _held(shape) < WHOLE * len(own)
-    }
-    side = {k: _side(flat[own]) for k, own in tried.items()}
+    ]
+    # Places make the first cut, across the ground and in height; the two surfaces it gives the second. What is seen through is not
+    # cut in height: parts of a ring lie on surfaces as well as the whole does, and are seen through no more.
+    ways = {k: (flat,) if int(shapes[k].status) & Status.SEEN_THROUGH else (flat, height) for k in able}
+    cuts = {(k, way): _side(of[members[k]]) for k in able for way, of in enumerate(ways[k])}
     good: dict[int, list[tuple[np.ndarray, Shape]]] = {}
-    # Places make the first cut, the two surfaces it gives the second.
     for _ in range(2):
-        pieces = {k: [np.sort(own[side[k] == i]) for i in (0, 1)] for k, own in tried.items()}
-        pieces = {k: two for k, two in pieces.items() if min(map(len, two)) >= max(FEWEST, SMALLEST * len(tried[k]))}
+        pieces = {cut: [members[cut[0]][side == i] for i in (0, 1)] for cut, side in cuts.items()}
+        pieces = {
+            c: two for c, two in pieces.items() if min(map(len, two)) >= max(FEWEST, SMALLEST * sum(map(len, two)))
+        }
         sets = [piece for two in pieces.values() for piece in two]
         found = iter(fit(sets) if sets else ())
-        tried = {k: tried[k] for k in pieces}
-        for k, two in pieces.items():
+        for (k, way), two in pieces.items():
             both = [(piece, next(found)) for piece in two]
             count = sum(_held(shape) for _, shape in both)
             named = [(shape, shape.primitive) for _, shape in both if shape.primitive is not None]
@@ -292,12 +298,13 @@ def _divided(
             inner = _contained(points, two, [shape for _, shape in both])
             if len(named) == 2 and not inner and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
                 good[k] = both
-            if len(named) < 2:
-                tried.pop(k)
-                continue
-            away = [distances(primitive, points[tried[k]]) for _, primitive in named]
-            near = np.minimum(*away) <= max(float(shape.noise_distance) for shape, _ in named)
-            side[k] = np.where(near, np.argmin(away, axis=0), side[k])
+            if len(named) == 2:
+                away = [distances(primitive, points[members[k]]) for _, primitive in named]
+                near = np.minimum(*away) <= max(float(shape.noise_distance) for shape, _ in named)
+                cuts[k, way] = np.where(near, np.argmin(away, axis=0), cuts[k, way])
+            else:
+                del cuts[k, way]
+        cuts = {cut: side for cut, side in cuts.items() if cut in pieces}
     return good
 
 
@@ -331,7 +338,7 @@ def _side(flat: np.ndarray) -> np.ndarray:
     """Which of two fuzzy clusters each place is in."""
     some = flat[np.linspace(0, len(flat) - 1, PLACES).astype(int)]
     middle = some.mean(axis=0)
-    long = np.linalg.eigh(np.cov(some.T))[1][:, -1]
+    long = np.linalg.eigh(np.atleast_2d(np.cov(some.T)))[1][:, -1]
     reach = ((some - middle) @ long).std()
     centers = np.asarray(fcm(some - middle, np.stack([-reach * long, reach * long])).centers)
     away = np.linalg.norm((flat - middle)[:, None] - centers, axis=-1)

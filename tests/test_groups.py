@@ -1,5 +1,7 @@
 """Groups made objects by their shapes, without the search: surfaces are stood in for by what a fit would say."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from jaxfuzzy.groups import _seen_from, _way_hidden, by_shapes
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
+from jaxfuzzy.status import Status
 from synthetic import fitted_shape
 
 ACROSS = np.array([[1.0, 0, 0], [0, 0, 1.0]])
@@ -87,6 +90,22 @@ def test_two_balls_that_touch_are_told_apart():
     held = fit([np.flatnonzero(np.asarray(alone.labels) == 0)])
     same, _ = by_shapes(points[:300], ACROSS, alone, held, fit, by_places(points))
     assert same is alone
+
+
+def test_one_ball_on_another_is_told_apart_but_not_a_ring():
+    # With some outliers none of the balls holds half of what lies on one side of an upright cut.
+    stray = np.random.default_rng(2).uniform([-0.05, -0.1, 0.95], [0.05, 0.3, 1.05], (120, 3))
+    points = np.concatenate([ball([0, 0, 1.0]), ball([0, 0.2, 1.0], seed=1), stray])
+    fit = fitted_to(points, [Sphere(jnp.array([0, y, 1.0]), jnp.asarray(0.1)) for y in (0.0, 0.2)])
+    parts = segment(points, ks=(1,))
+    members = np.flatnonzero(np.asarray(parts.labels) == 0)
+    whole = fitted_shape(None, np.zeros(len(members), bool), 0.005)
+    apart, shapes = by_shapes(points, ACROSS, parts, (whole,), fit, by_places(points))
+    assert [shape.kind for shape in shapes] == ["sphere", "sphere"]
+    labels = np.asarray(apart.labels)
+    assert len(set(labels[:300]) - {-1}) == len(set(labels[300:600]) - {-1}) == 1
+    through = dataclasses.replace(whole, status=jnp.asarray(int(Status.REFUSED | Status.SEEN_THROUGH)))
+    assert by_shapes(points, ACROSS, parts, (through,), fit, by_places(points))[0] is parts
 
 
 def test_what_a_body_leaves_over_is_an_object_where_a_surface_holds_it():
