@@ -19,8 +19,8 @@ from jaxfuzzy.status import Status
 # Neighboring pixels that together tell as much of a size as one independent point: 84 to 335, 190 on average, against the
 # ground truth of thirteen real pairs (`measure_noise`).
 PIXELS_PER_POINT = 190
-# As many independent points as the largest number of parameters of a kind.
-FEWEST = 6
+# Pixels of as many independent points as the largest number of parameters of a kind.
+FEWEST_PIXELS = 6 * PIXELS_PER_POINT
 # In nats of independent points: below, another family is as likely, and the next kind is nearly as good.
 TELLS, NARROW = 1.0, 3.0
 # Of its points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
@@ -78,7 +78,7 @@ def _told_apart(shape: Shape) -> Shape:
     count = len(shape.inliers)
     status = int(shape.status) & ~Status.LOW_MARGIN | (Status.LOW_MARGIN if shape.margin < NARROW else 0)
     shape = dataclasses.replace(shape, status=jnp.asarray(status, jnp.int32))
-    if count < FEWEST * PIXELS_PER_POINT:
+    if count < FEWEST_PIXELS:
         return refused(shape, Status.TOO_FEW_POINTS, "too few pixels for the errors that they share")
     if np.asarray(shape.inliers).mean() < HOLDS:
         return refused(shape, Status(0), "it holds too few of the object's points")

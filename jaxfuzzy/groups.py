@@ -57,6 +57,7 @@ def by_shapes(
     fit: Fit,
     parted: Parted,
     camera: np.ndarray | None = None,
+    least: int = FEWEST,
 ) -> tuple[Segmentation, tuple[Shape, ...]]:
     """Merges and divides groups where their shapes say so.
 
@@ -68,6 +69,7 @@ def by_shapes(
         fit: Fits shapes to sets of points given by their indices.
         parted: Divides points given by their indices by places: labels 0, 1, ..., -1 for none.
         camera: Where the points were seen from (3,).
+        least: Points below which no part of a group is an object.
 
     Returns:
         The division and the shapes that came of it; the same records where nothing changed.
@@ -78,8 +80,8 @@ def by_shapes(
     joined = _joined(points, flat, members, shapes, fit, camera)
     taken = gathered.union(*joined)
     height = points @ np.cross(*across)
-    divided = _divided(points, flat, height[:, None], members, shapes, taken, fit)
-    divided |= _peeled(points, members, shapes, taken.union(divided), fit, parted)
+    divided = _divided(points, flat, height[:, None], members, shapes, taken, fit, least)
+    divided |= _peeled(points, members, shapes, taken.union(divided), fit, parted, least)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []
@@ -271,12 +273,13 @@ def _divided(
     shapes: Sequence[Shape],
     taken: set[int],
     fit: Fit,
+    fewest: int,
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups that two surfaces hold much better than one, and these."""
     able = [
         k
         for k, (own, shape) in enumerate(zip(members, shapes, strict=True))
-        if k not in taken and len(own) >= 2 * FEWEST and _held(shape) < WHOLE * len(own)
+        if k not in taken and len(own) >= 2 * fewest and _held(shape) < WHOLE * len(own)
     ]
     # Places make the first cut, across the ground and in height; the two surfaces it gives the second. What is seen through is not
     # cut in height: parts of a ring lie on surfaces as well as the whole does, and are seen through no more.
@@ -286,7 +289,7 @@ def _divided(
     for _ in range(2):
         pieces = {cut: [members[cut[0]][side == i] for i in (0, 1)] for cut, side in cuts.items()}
         pieces = {
-            c: two for c, two in pieces.items() if min(map(len, two)) >= max(FEWEST, SMALLEST * sum(map(len, two)))
+            c: two for c, two in pieces.items() if min(map(len, two)) >= max(fewest, SMALLEST * sum(map(len, two)))
         }
         sets = [piece for two in pieces.values() for piece in two]
         found = iter(fit(sets) if sets else ())
@@ -315,11 +318,12 @@ def _peeled(
     taken: set[int],
     fit: Fit,
     parted: Parted,
+    fewest: int,
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these."""
     left: list[tuple[int, np.ndarray]] = []
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
-        rest, least = own[~np.asarray(shape.inliers)], max(FEWEST, SMALLEST * len(own))
+        rest, least = own[~np.asarray(shape.inliers)], max(fewest, SMALLEST * len(own))
         if k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
             labels = parted(rest)
             pieces = [rest[labels == i] for i in range(labels.max(initial=-1) + 1)]

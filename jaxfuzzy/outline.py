@@ -89,7 +89,7 @@ def without_seen_through(
             return shape
         return refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
 
-    return tuple(side_by_side(told, zip(members, shapes, strict=True)))
+    return tuple(side_by_side(told, zip(members, shapes, strict=True), len(points)))
 
 
 class Through(NamedTuple):

@@ -14,9 +14,9 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, lengths, record, static
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.evidence import in_independent_points, told_apart
+from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart
 from jaxfuzzy.ground import fit_ground, foreground
-from jaxfuzzy.groups import by_shapes, members_of
+from jaxfuzzy.groups import FEWEST, by_shapes, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
@@ -261,12 +261,13 @@ def _model(
         def as_kind(of: Sequence[int], kind: str) -> tuple[Shape, ...]:
             return in_independent_points(fitted([members[i] for i in of], kinds=(kind,)), OF_SCENE)
 
+        correlated = cloud.pixels_px is not None and shape_rule != "paper"
+        least = FEWEST_PIXELS if correlated else FEWEST
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
             across = np.asarray(tangents(jnp.asarray(vertical)))
-            parts, shapes = by_shapes(places, across, parts, shapes, fit, parted, eye)
+            parts, shapes = by_shapes(places, across, parts, shapes, fit, parted, eye, least)
             members = members_of(parts)
-        correlated = cloud.pixels_px is not None and shape_rule != "paper"
         if correlated:
             shapes = in_independent_points(shapes, OF_SCENE)
         if sight is not None:

@@ -213,7 +213,7 @@ def fit_members(
         own = None if delta is None else delta[m] / DEVIATIONS
         return prepared(p[m], w[m], own, vertical, eye, along_ray) if len(m) else None
 
-    objects = side_by_side(ready, members)
+    objects = side_by_side(ready, members, sum(map(len, members)))
     poor = [unfit(o) for o in objects]
     good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
     most = max((len(o.points) for o in good), default=1)
@@ -325,20 +325,17 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
     """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
     good = {i: look for i, look in looks.items() if not look.reason}
+    points = sum(len(look.item.points) for look in good.values())
     judge = lambda look: judged(look.item, look.fitted, settings.along_ray)
-    seen = dict(zip(good, side_by_side(judge, good.values()), strict=True))
+    seen = dict(zip(good, side_by_side(judge, good.values(), points), strict=True))
     same = {kind: [i for i, o in good.items() if KINDS[o.fitted.kind] == kind] for kind in KINDS}
     parts = [(kind, part) for kind, own in same.items() for part in batches(own)]
-
-    def surfaces(part: tuple[str, Sequence[int]]) -> Any:
-        kind, own = part
-        return jax.device_get(
-            assemble_batch(kind, *_surfaces([good[i] for i in own], [seen[i] for i in own], settings))
-        )
-
+    surface = lambda of: (of[0], *_surfaces([good[i] for i in of[1]], [seen[i] for i in of[1]], settings))
+    surfaces = side_by_side(surface, parts, points)
     made: dict[int, tuple[Primitive, np.ndarray]] = {}
-    # Every kind is compiled in the first call, for the sake of which they are made side by side too.
-    for (_, part), found in zip(parts, side_by_side(surfaces, parts), strict=True):
+    # For the sake of the first call, which compiles every kind.
+    assembled = side_by_side(lambda s: jax.device_get(assemble_batch(*s)), surfaces)
+    for (_, part), found in zip(parts, assembled, strict=True):
         made |= {i: jax.tree.map(lambda a, j=j: a[j], found) for j, i in enumerate(part)}
     arrays, rest = [], []
     for i, size in enumerate(sizes):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.choice import PLANE_BONUS
-from jaxfuzzy.evidence import FEWEST, HOLDS, NARROW, PIXELS_PER_POINT, TELLS, in_independent_points, told_apart
+from jaxfuzzy.evidence import FEWEST_PIXELS, HOLDS, NARROW, PIXELS_PER_POINT, TELLS, in_independent_points, told_apart
 from jaxfuzzy.primitives import Cylinder, Plane
 from jaxfuzzy.shapes import GUARDS
 from jaxfuzzy.status import Status
@@ -77,10 +77,10 @@ def test_the_bonus_of_planes_is_no_evidence():
 
 def test_too_few_independent_points_refuse():
     scores = {"plane": 30.0, "cylinder": 0.0}
-    shape = told(scores, pixels=FEWEST * PIXELS_PER_POINT - 1)
+    shape = told(scores, pixels=FEWEST_PIXELS - 1)
     assert shape.kind == "unknown"
     assert int(shape.status) == Status.REFUSED | Status.TOO_FEW_POINTS
-    assert told(scores, pixels=FEWEST * PIXELS_PER_POINT).kind == "cylinder"
+    assert told(scores, pixels=FEWEST_PIXELS).kind == "cylinder"
 
 
 def test_a_surface_that_holds_few_of_its_points_is_refused():
