@@ -49,8 +49,6 @@ UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
 # Sine of the angle from which on two normals tell an axis, and of the error of a normal; and the share that must agree on one: of
 # lying cylinders in photographs 0.75 and more, of blobs among outliers 0.54 and less.
 APART, SLANT, AGREE = 0.3, 0.1, 0.65
-# Points from which on NumPy's work is divided among threads.
-MANY = 200_000
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
 
@@ -178,16 +176,8 @@ def threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, initializer=enter)
 
 
-def side_by_side(work: Callable[[T], R], items: Iterable[T], points: int | None = None) -> list[R]:
-    """What work makes of each item, as many at a time as there are processors.
-
-    Args:
-        work: What to do with an item.
-        items: The items.
-        points: Where the work is NumPy's: how many points the items have; threads that take turns at few only lose time.
-    """
-    if points is not None and points < MANY:
-        return [work(item) for item in items]
+def side_by_side(work: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """What compiled work makes of each item, as many at a time as there are processors; NumPy's own would only take turns."""
     with threads(os.cpu_count() or 1) as pool:
         return list(pool.map(work, items))
 

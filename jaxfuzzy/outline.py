@@ -13,7 +13,6 @@ import numpy as np
 
 from jaxfuzzy.arrays import lengths
 from jaxfuzzy.linalg import tangents
-from jaxfuzzy.looks import side_by_side
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Shape, refused
@@ -82,14 +81,12 @@ def without_seen_through(
         shapes: The shapes.
         sight: What the camera sees.
     """
-
-    def told(of: tuple[np.ndarray, Shape]) -> Shape:
-        own, shape = of
-        if seen_through(points, own, shape, sight).share <= THROUGH:
-            return shape
-        return refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
-
-    return tuple(side_by_side(told, zip(members, shapes, strict=True), len(points)))
+    return tuple(
+        refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
+        if seen_through(points, own, shape, sight).share > THROUGH
+        else shape
+        for own, shape in zip(members, shapes, strict=True)
+    )
 
 
 class Through(NamedTuple):
@@ -118,7 +115,7 @@ def seen_through(points: np.ndarray, own: np.ndarray, shape: Shape, sight: Sight
         return Through(0.0, 0.0)
     mine = np.zeros(len(points), bool)
     mine[own] = True
-    held = np.asarray(points[own[inliers]], float)
+    held = np.asarray(points.take(own[inliers], axis=0), float)
     return _through(shape.primitive, float(shape.noise_distance), held, mine[sight.which], sight)
 
 

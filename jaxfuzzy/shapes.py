@@ -17,7 +17,7 @@ from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, 
 from jaxfuzzy.fitting import TOLERANCES, Fitted, Judged, assemble_batch, judged
 from jaxfuzzy.looks import Look, Settings, look_at, side_by_side, unfit
 from jaxfuzzy.mostpoints import most_points
-from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, Prepared, batches, capacity_for, prepared
+from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, batches, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.quadrics import quadric_of
 from jaxfuzzy.search import KINDS
@@ -208,12 +208,12 @@ def fit_members(
     p = np.asarray(array, float)
     w = np.ones(count) if weight is None else np.asarray(weight, float)
     along_ray = distance == "ray" or (rule == "paper" and eye is not None)
-
-    def ready(m: np.ndarray) -> Prepared | None:
-        own = None if delta is None else delta[m] / DEVIATIONS
-        return prepared(p[m], w[m], own, vertical, eye, along_ray) if len(m) else None
-
-    objects = side_by_side(ready, members, sum(map(len, members)))
+    objects = [
+        prepared(p.take(m, axis=0), w[m], None if delta is None else delta[m] / DEVIATIONS, vertical, eye, along_ray)
+        if len(m)
+        else None
+        for m in members
+    ]
     poor = [unfit(o) for o in objects]
     good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
     most = max((len(o.points) for o in good), default=1)
@@ -325,13 +325,10 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
     """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
     good = {i: look for i, look in looks.items() if not look.reason}
-    points = sum(len(look.item.points) for look in good.values())
-    judge = lambda look: judged(look.item, look.fitted, settings.along_ray)
-    seen = dict(zip(good, side_by_side(judge, good.values(), points), strict=True))
+    seen = {i: judged(look.item, look.fitted, settings.along_ray) for i, look in good.items()}
     same = {kind: [i for i, o in good.items() if KINDS[o.fitted.kind] == kind] for kind in KINDS}
     parts = [(kind, part) for kind, own in same.items() for part in batches(own)]
-    surface = lambda of: (of[0], *_surfaces([good[i] for i in of[1]], [seen[i] for i in of[1]], settings))
-    surfaces = side_by_side(surface, parts, points)
+    surfaces = [(kind, *_surfaces([good[i] for i in part], [seen[i] for i in part], settings)) for kind, part in parts]
     made: dict[int, tuple[Primitive, np.ndarray]] = {}
     # For the sake of the first call, which compiles every kind.
     assembled = side_by_side(lambda s: jax.device_get(assemble_batch(*s)), surfaces)
