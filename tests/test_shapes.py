@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxfuzzy import bounds, looks, starts
-from jaxfuzzy.objects import Frame
+from jaxfuzzy.objects import MOST, Frame, fair_order
 from jaxfuzzy.shapes import fit_members, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
 from jaxfuzzy.status import Status
@@ -259,6 +259,18 @@ def test_large_objects_are_fitted_to_a_sample_and_judged_whole():
     assert abs(float(shape.primitive.radius - cloud.truths[0].primitive.radius)) < 4 * deviation
     # 2.5 deviations leave 1.2 % of the good points out; an outlier on the surface by chance is in.
     assert (np.asarray(shape.inliers) == (cloud.labels >= 0)).mean() > 0.95
+
+
+def test_of_very_many_points_those_that_are_fitted_are_drawn_fairly_whatever_their_order():
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 300), np.linspace(-1, 1, 200)))
+    points = np.stack([x, y, 0.1 * x**2], axis=1)
+    order = fair_order(points)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(points)))
+    shuffled = np.random.default_rng(0).permutation(len(points))
+    np.testing.assert_array_equal(shuffled[fair_order(points[shuffled])[:MOST]], order[:MOST])
+    # Of 64 equal squares each has its share, 5 deviations of chance allowed.
+    counts = np.histogram2d(*points[order[:2048], :2].T, bins=8)[0]
+    assert np.abs(counts - 32).max() < 5 * np.sqrt(32)
 
 
 def test_single_precision_without_a_camera_agrees_with_double(clouds):
