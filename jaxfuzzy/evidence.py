@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxfuzzy.choice import PLANE_BONUS
 from jaxfuzzy.search import KINDS, MORE
-from jaxfuzzy.shapes import Shape, refused
+from jaxfuzzy.shapes import FAMILIES, Shape, refused
 from jaxfuzzy.status import Status
 
 # Neighboring pixels that together tell as much of a size as one independent point: 84 to 335, 190 on average, against the
@@ -25,8 +25,6 @@ FEWEST_PIXELS = 6 * PIXELS_PER_POINT
 TELLS, NARROW = 1.0, 3.0
 # Of its points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
 HOLDS = 0.3
-# A plane is a face of a box, a cylinder a cone that does not narrow.
-FAMILIES = {"plane": "flat", "box": "flat", "cylinder": "turned", "cone": "turned", "sphere": "sphere"}
 
 
 def in_independent_points(shapes: Sequence[Shape], fitted_to: int) -> tuple[Shape, ...]:

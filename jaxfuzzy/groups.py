@@ -10,7 +10,7 @@ is an object beside the first.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +21,12 @@ from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.primitives import Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.segment import Segmentation
-from jaxfuzzy.shapes import Shape
+from jaxfuzzy.shapes import FAMILIES, Shape
 from jaxfuzzy.status import Status
 
-Fit = Callable[[Sequence[np.ndarray]], tuple[Shape, ...]]
+K = TypeVar("K")
+# Fits shapes to sets of points given by their indices; of shares of larger sets it is told these too.
+Fit = Callable[..., tuple[Shape, ...]]
 # Labels by places of the points with these indices.
 Parted = Callable[[np.ndarray], np.ndarray]
 
@@ -45,6 +47,8 @@ HOLDS, HOLDS_OF_ALL = 0.9, 0.7
 WHOLE, EXPLAINED, GAINED = 0.8, 0.7, 0.15
 # A part with fewer points is no object, nor one with a smaller share of its group.
 FEWEST, SMALLEST = 60, 0.1
+# What is only tried is fitted to a fair share of its points: so many, and less than twice as many.
+TRIED = 8192
 # A group is cut by so many of its places, with repetition where it has fewer, so that one program serves all.
 PLACES = 1024
 
@@ -189,23 +193,37 @@ def _joined(
     able_pairs = (p for p in apart if apart[p] < NEAR or (apart[p] < FAR and view is not None and _way_hidden(view, p)))
     pairs = sorted(able_pairs, key=apart.__getitem__)[:MOST_PAIRS]
     both = [np.sort(np.concatenate([members[a], members[b]])) for a, b in pairs]
-    good: list[tuple[float, tuple[int, int], tuple[np.ndarray, Shape]]] = []
-    for (a, b), own, shape in zip(pairs, both, fit(both) if both else (), strict=True):
-        if shape.primitive is None:
+    good: list[tuple[float, tuple[int, int], np.ndarray]] = []
+    some = [_some(own) for own in both]
+    for (a, b), of, own, shape in zip(pairs, some, both, fit(some, both) if both else (), strict=True):
+        families = {FAMILIES.get(shapes[k].kind) for k in (a, b)}
+        # Two parts that are flat are no part of a cone.
+        if shape.primitive is None or (len(families) == 1 and not families <= {None, FAMILIES.get(shape.kind)}):
             continue
-        held = own[np.asarray(shape.inliers)]
+        held = of[np.asarray(shape.inliers)]
         shares = []
         for k in (a, b):
-            part = np.isin(held, members[k]).sum()
+            part = np.isin(held, members[k]).sum() * len(own) / len(of)
             alone = _held(shapes[k])
             shares.append(part / (HOLDS * alone if alone else HOLDS_OF_ALL * len(members[k])))
         if min(shares) >= 1:
-            good.append((min(shares), (a, b), (own, shape)))
-    chosen: dict[tuple[int, int], tuple[np.ndarray, Shape]] = {}
-    for _, pair, found in sorted(good, key=lambda g: -g[0]):
+            good.append((min(shares), (a, b), own))
+    chosen: dict[tuple[int, int], np.ndarray] = {}
+    for _, pair, own in sorted(good, key=lambda g: -g[0]):
         if not {i for p in chosen for i in p} & set(pair):
-            chosen[pair] = found
-    return chosen
+            chosen[pair] = own
+    return _named(chosen, fit)
+
+
+def _some(own: np.ndarray) -> np.ndarray:
+    """A fair share of the points of a set."""
+    return own[:: max(1, len(own) // TRIED)]
+
+
+def _named(sets: dict[K, np.ndarray], fit: Fit) -> dict[K, tuple[np.ndarray, Shape]]:
+    """The shapes of sets, of those that have one."""
+    found = zip(sets.items(), fit(list(sets.values())) if sets else (), strict=True)
+    return {key: (own, shape) for (key, own), shape in found if shape.primitive is not None}
 
 
 class View(NamedTuple):
@@ -285,22 +303,23 @@ def _divided(
     # cut in height: parts of a ring lie on surfaces as well as the whole does, and are seen through no more.
     ways = {k: (flat,) if int(shapes[k].status) & Status.SEEN_THROUGH else (flat, height) for k in able}
     cuts = {(k, way): _side(of[members[k]]) for k in able for way, of in enumerate(ways[k])}
-    good: dict[int, list[tuple[np.ndarray, Shape]]] = {}
+    good: dict[int, tuple[float, list[np.ndarray]]] = {}
     for _ in range(2):
         pieces = {cut: [members[cut[0]][side == i] for i in (0, 1)] for cut, side in cuts.items()}
         pieces = {
             c: two for c, two in pieces.items() if min(map(len, two)) >= max(fewest, SMALLEST * sum(map(len, two)))
         }
         sets = [piece for two in pieces.values() for piece in two]
-        found = iter(fit(sets) if sets else ())
+        some = [_some(piece) for piece in sets]
+        found = iter(zip(some, fit(some, sets) if sets else (), strict=True))
         for (k, way), two in pieces.items():
-            both = [(piece, next(found)) for piece in two]
-            count = sum(_held(shape) for _, shape in both)
+            both = [next(found) for _ in two]
+            count = sum(_held(shape) / len(of) * len(piece) for piece, (of, shape) in zip(two, both, strict=True))
             named = [(shape, shape.primitive) for _, shape in both if shape.primitive is not None]
             least = max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k]))
-            inner = _contained(points, two, [shape for _, shape in both])
-            if len(named) == 2 and not inner and count >= max(least, sum(_held(shape) for _, shape in good.get(k, ()))):
-                good[k] = both
+            inner = _contained(points, [of for of, _ in both], [shape for _, shape in both])
+            if len(named) == 2 and not inner and count >= max(least, good[k][0] if k in good else 0.0):
+                good[k] = count, two
             if len(named) == 2:
                 away = [distances(primitive, points[members[k]]) for _, primitive in named]
                 near = np.minimum(*away) <= max(float(shape.noise_distance) for shape, _ in named)
@@ -308,7 +327,8 @@ def _divided(
             else:
                 del cuts[k, way]
         cuts = {cut: side for cut, side in cuts.items() if cut in pieces}
-    return good
+    whole = _named({(k, i): piece for k, (_, two) in good.items() for i, piece in enumerate(two)}, fit)
+    return {k: [whole[k, 0], whole[k, 1]] for k in good if (k, 0) in whole and (k, 1) in whole}
 
 
 def _peeled(

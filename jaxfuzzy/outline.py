@@ -71,7 +71,11 @@ def sight_of(points: np.ndarray, loose: np.ndarray, camera: np.ndarray, up: np.n
 
 
 def without_seen_through(
-    points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequence[Shape], sight: Sight
+    points: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    sight: Sight,
+    wholes: Sequence[np.ndarray] | None = None,
 ) -> tuple[Shape, ...]:
     """Names "unknown" what would hide points that are seen, by the status SEEN_THROUGH.
 
@@ -80,12 +84,13 @@ def without_seen_through(
         members: Indices of the points of each shape.
         shapes: The shapes.
         sight: What the camera sees.
+        wholes: Indices of all points of each object, where the shapes are those of a share of them.
     """
     return tuple(
         refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
-        if seen_through(points, own, shape, sight).share > THROUGH
+        if seen_through(points, own, shape, sight, whole).share > THROUGH
         else shape
-        for own, shape in zip(members, shapes, strict=True)
+        for own, shape, whole in zip(members, shapes, wholes or members, strict=True)
     )
 
 
@@ -101,7 +106,9 @@ class Through(NamedTuple):
     points: float
 
 
-def seen_through(points: np.ndarray, own: np.ndarray, shape: Shape, sight: Sight) -> Through:
+def seen_through(
+    points: np.ndarray, own: np.ndarray, shape: Shape, sight: Sight, whole: np.ndarray | None = None
+) -> Through:
     """What is seen through a shape; nothing where it is none.
 
     Args:
@@ -109,12 +116,13 @@ def seen_through(points: np.ndarray, own: np.ndarray, shape: Shape, sight: Sight
         own: Indices of the shape's points.
         shape: The shape.
         sight: What the camera sees.
+        whole: Indices of all points of the object, where the shape is that of a share of them.
     """
     inliers = np.asarray(shape.inliers)
     if shape.primitive is None or isinstance(shape.primitive, Quadric) or not inliers.any():
         return Through(0.0, 0.0)
     mine = np.zeros(len(points), bool)
-    mine[own] = True
+    mine[own if whole is None else whole] = True
     held = np.asarray(points.take(own[inliers], axis=0), float)
     return _through(shape.primitive, float(shape.noise_distance), held, mine[sight.which], sight)
 

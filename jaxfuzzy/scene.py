@@ -251,9 +251,11 @@ def _model(
         def fitted(sets: Sequence[np.ndarray], **only: Any) -> tuple[Shape, ...]:
             return fit_members(places, sets, **seen(own) | picked | {"rule": shape_rule, "capacity": OF_SCENE} | only)
 
-        def fit(sets: Sequence[np.ndarray]) -> tuple[Shape, ...]:
-            found = fitted(sets)
-            return found if sight is None else without_seen_through(points, [own[m] for m in sets], found, sight)
+        def fit(sets: Sequence[np.ndarray], wholes: Sequence[np.ndarray] | None = None) -> tuple[Shape, ...]:
+            found, of = fitted(sets), [own[m] for m in wholes or sets]
+            if sight is None:
+                return found
+            return without_seen_through(points, [own[m] for m in sets], found, sight, of)
 
         def parted(of: np.ndarray) -> np.ndarray:
             return np.asarray(segment(places[of], **seen(own[of])).labels)

@@ -27,6 +27,8 @@ from jaxfuzzy.status import Status
 NO_QUADRIC = Status.REFUSED | Status.ALL_NOISE | Status.SEEN_THROUGH | Status.PIECE
 # Nats of margin below which the next kind is nearly as good.
 NARROW = 10.0
+# A plane is a face of a box, a cylinder a cone that does not narrow.
+FAMILIES = {"plane": "flat", "box": "flat", "cylinder": "turned", "cone": "turned", "sphere": "sphere"}
 GUARDS = {
     "plane": "not tried",
     "box": "a face holds too few of the points within its extent",

@@ -30,7 +30,7 @@ def shape_of(points, body, noise=0.005):
 def fitted_to(points, bodies):
     """Takes for every set the body that holds most of it."""
 
-    def fit(sets):
+    def fit(sets, wholes=None):
         best = lambda own: max((shape_of(points[own], s) for s in bodies), key=lambda s: int(s.inliers.sum()))
         return tuple(best(own) for own in sets)
 
@@ -72,6 +72,10 @@ def test_two_parts_of_one_ball_are_merged_and_a_stranger_is_not():
     np.testing.assert_allclose(float(merged.sizes.sum()), 1, rtol=1e-6)
     for k, shape in enumerate(shapes):
         assert len(shape.inliers) == (labels == k).sum()
+    # Parts that are flat are none of a ball.
+    flat = Plane(jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros((4, 3)))
+    planes = tuple(fitted_shape(flat, np.ones(len(own), bool), 0.005) for own in members)
+    assert by_shapes(points, ACROSS, parts, planes, fit, by_places(points))[0] is parts
 
 
 def test_two_balls_that_touch_are_told_apart():
