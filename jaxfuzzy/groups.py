@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy import checks
 from jaxfuzzy.arrays import lengths
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
@@ -345,7 +346,10 @@ def _peeled(
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
         rest, least = own[~np.asarray(shape.inliers)], max(fewest, SMALLEST * len(own))
         if k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
-            labels = parted(rest)
+            try:
+                labels = parted(rest)
+            except checks.DataError:  # too scattered: there is no part of it
+                continue
             pieces = [rest[labels == i] for i in range(labels.max(initial=-1) + 1)]
             left += [(k, piece) for piece in pieces if len(piece) >= least]
     others: dict[int, list[tuple[np.ndarray, Shape]]] = {}
@@ -355,7 +359,12 @@ def _peeled(
             others.setdefault(k, []).append((piece, shape))
     stay = {k: np.setdiff1d(members[k], np.concatenate([piece for piece, _ in of])) for k, of in others.items()}
     anew = fit(list(stay.values())) if stay else ()
-    return {k: [(stay[k], shape), *others[k]] for k, shape in zip(stay, anew, strict=True)}
+    found = {}
+    for (k, own), shape in zip(stay.items(), anew, strict=True):
+        if shape.primitive is None:  # what was named with the parts stays so without them
+            shape = dataclasses.replace(shapes[k], inliers=shapes[k].inliers[np.isin(members[k], own)])
+        found[k] = [(own, shape), *others[k]]
+    return found
 
 
 def _side(flat: np.ndarray) -> np.ndarray:

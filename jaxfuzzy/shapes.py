@@ -47,8 +47,8 @@ class Shape:
         primitive: The primitive; None where unknown.
         inliers: Which of the object's points lie on it.
         noise_distance: The noise distance used, in metres (the median where it differs from point to point).
-        scores: Score of every kind tried, lower is better.
-        margin: Score of the second best less that of the best, of those no guard spoke against.
+        scores: Score of every kind tried, the best of all looks at it; lower is better.
+        margin: Score of the best other kind that no guard spoke against less that of this one; below 0 where that one was refused.
         counts: Inliers in each embedding, where the paper's rule was asked for.
         covariance: Of `primitive.parameters()`.
         status: Reasons to read this with care; see `describe`.
@@ -409,8 +409,8 @@ def _told(fitted: Fitted, kinds: tuple[str, ...]) -> tuple[dict[str, float], flo
     """Scores, margin, and the guards that spoke."""
     scores = {k: float(s) for k, s in zip(KINDS, fitted.scores, strict=True) if k in kinds}
     passed = {k for k, good in zip(KINDS, fitted.passed, strict=True) if good}
-    ranked = sorted(score for k, score in scores.items() if k in passed)
-    margin = ranked[1] - ranked[0] if len(ranked) > 1 else float("inf")
+    rivals = [score for k, score in scores.items() if k in passed and k != KINDS[fitted.kind]]
+    margin = min(rivals) - scores[KINDS[fitted.kind]] if rivals else float("inf")
     return scores, margin, tuple(f"{k}: {GUARDS[k]}" for k in scores if k not in passed)
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfuzzy.checks import DataError
 from jaxfuzzy.groups import _seen_from, _way_hidden, by_shapes
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
@@ -130,6 +131,11 @@ def test_what_a_body_leaves_over_is_an_object_where_a_surface_holds_it():
     assert (labels[700:900] == 1).mean() > 0.95
     assert not (labels[900:] == 1).any()
     assert [len(shape.inliers) for shape in shapes] == [(labels == k).sum() for k in (0, 1)]
+
+    def scattered(_):
+        raise DataError("too scattered")
+
+    assert by_shapes(points, ACROSS, parts, fit([members]), fit, scattered)[0] is parts
 
 
 def wall(radius, toward, count=500, seed=0):
