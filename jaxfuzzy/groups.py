@@ -281,7 +281,7 @@ def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Sha
     if shape.primitive is not None:
         inliers = distances(shape.primitive, points[every]) <= float(shape.noise_distance)
     inliers[np.isin(every, own)] = np.asarray(shape.inliers)
-    return dataclasses.replace(shape, inliers=jnp.asarray(inliers))
+    return dataclasses.replace(shape, inliers=jax.device_put(inliers))
 
 
 def _divided(
@@ -362,7 +362,8 @@ def _peeled(
     found = {}
     for (k, own), shape in zip(stay.items(), anew, strict=True):
         if shape.primitive is None:  # what was named with the parts stays so without them
-            shape = dataclasses.replace(shapes[k], inliers=shapes[k].inliers[np.isin(members[k], own)])
+            inliers = np.asarray(shapes[k].inliers)[np.isin(members[k], own)]
+            shape = dataclasses.replace(shapes[k], inliers=jax.device_put(inliers))
         found[k] = [(own, shape), *others[k]]
     return found
 

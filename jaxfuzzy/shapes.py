@@ -256,7 +256,7 @@ def with_quadrics(
             found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
         if found is not None:
             quadric = jax.tree.map(lambda a: jnp.asarray(a, points.dtype), found[0])
-            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jnp.asarray(found[1]))
+            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jax.device_put(found[1]))
         told.append(shape)
     return tuple(told)
 
@@ -267,7 +267,7 @@ def refused(shape: Shape, status: Status, why: str) -> Shape:
         shape,
         kind="unknown",
         primitive=None,
-        inliers=jnp.zeros_like(shape.inliers),
+        inliers=jax.device_put(np.zeros(len(shape.inliers), bool)),
         covariance=jnp.zeros((0, 0), shape.covariance.dtype),
         status=jnp.asarray(Status.REFUSED | status, jnp.int32),
         guards=(*shape.guards, f"{shape.kind}: {why}"),
