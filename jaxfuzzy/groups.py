@@ -136,7 +136,7 @@ def _gathered(
 def _contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequence[Shape]) -> dict[int, int]:
     """Which groups lie inside the round body of another, and of which."""
     into: dict[int, int] = {}
-    some = [points[own[:: max(1, len(own) // ASKED)]] for own in members]
+    some = [points[_some(own, ASKED)] for own in members]
     # Of two that lie inside each other the one whose surface holds more points is the body.
     for a in sorted(range(len(members)), key=lambda k: -_held(shapes[k])):
         if a in into or _held(shapes[a]) < SURFACE * len(members[a]):
@@ -216,9 +216,9 @@ def _joined(
     return _named(chosen, fit)
 
 
-def _some(own: np.ndarray) -> np.ndarray:
-    """A fair share of the points of a set."""
-    return own[:: max(1, len(own) // TRIED)]
+def _some(own: np.ndarray, count: int = TRIED) -> np.ndarray:
+    """A fair share of the points of a set: so many, and less than twice as many."""
+    return own[:: max(1, len(own) // count)]
 
 
 def _named(sets: dict[K, np.ndarray], fit: Fit) -> dict[K, tuple[np.ndarray, Shape]]:

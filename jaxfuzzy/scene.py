@@ -252,9 +252,10 @@ def _model(
             return fit_members(places, sets, **seen(own) | picked | {"rule": shape_rule, "capacity": OF_SCENE} | only)
 
         def fit(sets: Sequence[np.ndarray], wholes: Sequence[np.ndarray] | None = None) -> tuple[Shape, ...]:
-            found, of = fitted(sets), [own[m] for m in wholes or sets]
+            found = fitted(sets)
             if sight is None:
                 return found
+            of = None if wholes is None else [own[m] for m in wholes]
             return without_seen_through(points, [own[m] for m in sets], found, sight, of)
 
         def parted(of: np.ndarray) -> np.ndarray:

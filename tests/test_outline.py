@@ -89,6 +89,20 @@ def test_a_whole_body_stays(name):
         assert after is before
 
 
+def test_points_of_the_whole_object_behind_a_share_of_it_do_not_speak_against_it():
+    ray = rays()
+    depth = met(BODIES["sphere"], ray)
+    hits = np.flatnonzero(np.isfinite(depth))
+    open_ = hits[np.isin(hits % 121, range(61, 121))]
+    depth[open_] = WALL
+    points = np.where(np.isfinite(depth), depth, WALL)[:, None] * ray
+    share = np.setdiff1d(hits, open_)[::2]
+    shape = fitted_shape(BODIES["sphere"], np.ones(len(share), bool), 0.005)
+    sight = sight_of(points, ~np.isfinite(met(BODIES["sphere"], ray)), CAMERA, UP)
+    assert without_seen_through(points, [share], [shape], sight, [hits])[0] is shape
+    assert without_seen_through(points, [share], [shape], sight)[0].kind == "unknown"
+
+
 @pytest.mark.parametrize("name", BODIES)
 def test_a_body_that_is_seen_through_is_refused(name):
     """Twigs: of each body only some crooked stripes are there."""
