@@ -72,6 +72,7 @@ def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: b
             take(found.scale),
             take(found.background),
             item["depth_range"],
+            item["lean"],
             SCALES,
             TOLERANCES[dtype],
         )

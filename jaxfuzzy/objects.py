@@ -23,6 +23,8 @@ MOST = CAPACITIES[-1]
 OF_SCENE = CAPACITIES[0]
 BATCH = 8
 GOLDEN = 0.6180339887498949
+# So that an upright frame known to a few degrees does no harm: ten degrees.
+LEAN = 0.1745
 # Height, and a trace of place for points of one height.
 TO_HEIGHT = np.array([1e-7, 1.0, 1.7e-7])
 
@@ -55,6 +57,7 @@ class Prepared(NamedTuple):
         given: Whether the deviation is known.
         frame: The frame.
         flatness: Spread along the second and third principal axis over that along the first.
+        lean: Standard deviation in radians with which its axis may lean from the vertical, in the last polish.
     """
 
     points: np.ndarray
@@ -68,6 +71,7 @@ class Prepared(NamedTuple):
     given: bool
     frame: Frame
     flatness: tuple[float, float]
+    lean: float = LEAN
 
 
 def prepared(
@@ -199,12 +203,18 @@ def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, n
         "eye": np.zeros((count, 3), dtype),
         "depth_range": np.ones(count, dtype),
         "given": np.ones(count, bool),
+        "lean": np.ones(count, dtype),
     }
     for i, o in enumerate(items):
         n = min(len(o.points), capacity)
         batch["points"][i, :, :n], batch["rays"][i, :, :n] = o.points[:n].T, o.rays[:n].T
         batch["gain"][i, :n], batch["weight"][i, :n] = o.gain[:n], o.weight[:n]
-        batch["eye"][i], batch["depth_range"][i], batch["given"][i] = o.eye, o.depth_range, o.given
+        batch["eye"][i], batch["depth_range"][i], batch["given"][i], batch["lean"][i] = (
+            o.eye,
+            o.depth_range,
+            o.given,
+            o.lean,
+        )
     return batch
 
 

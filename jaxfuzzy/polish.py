@@ -1,6 +1,6 @@
 """The winner on all points: Gauss-Newton steps under mixture memberships until it stands still, and its covariance.
 
-The axis is free to lean, with a prior of ten degrees, so that an upright frame known to a few degrees does no harm. Weights
+The axis is free to lean, with a prior. Weights
 are the probabilities of belonging to the surface; they fall off for good points too, which the plain inverse normal matrix
 does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Ĵᵀ (Huber, Robust Statistics, 1981), J
 the derivatives that steps take and Ĵ the true ones: along a ray that grazes the surface the former are damped. In ψ² a residual
@@ -21,7 +21,6 @@ from jaxfuzzy.choice import HALF_LOG_2PI
 from jaxfuzzy.rays import Meeting, Residual, View
 
 MOST_STEPS = 120
-LEAN_PRIOR = 0.1745
 # Below lie the last few points before a silhouette, where a surface bends away faster than a derivative tells.
 LEAST_DAMPING = 0.2
 MOST_LEVERAGE = 0.9
@@ -87,6 +86,7 @@ def polish(
     scale: Array,
     background: Array,
     depth_range: Array,
+    lean: Array,
     scale_bounds: tuple[float, float],
     tolerance: float,
 ) -> Polished:
@@ -100,13 +100,14 @@ def polish(
         scale: Noise to start from.
         background: Share of background to start from.
         depth_range: Range of depth over which background is spread.
+        lean: Standard deviation of the prior on the axis' lean, in radians.
         scale_bounds: Least and largest noise scale.
         tolerance: Stop when no parameter changes by more, in units of the object's spread.
     """
     outside = -jnp.log(depth_range * view.gain)
     count = view.mask.sum()
     free, dtype = candidate.free, view.gain.dtype
-    prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / LEAN_PRIOR**2 * free
+    prior = jnp.array([0, 0, 0, 0, 0, 1, 1], dtype) / lean**2 * free
 
     def look(state: _State) -> _Look:
         square, log_variance, damping, rows = residual_of(
@@ -161,7 +162,8 @@ def polish(
     inverse = starts.invert(normal(end.theta, seen.rows, bend, end.scale), jnp.eye(7, dtype=dtype))
     leverage = seen.own / end.scale**2 * (seen.rows * (inverse @ seen.rows)).sum(0)
     pull = seen.own * seen.error / end.scale / (1 - jnp.clip(leverage, 0.0, MOST_LEVERAGE))
-    meat = (seen.rows * pull**2) @ seen.rows.T / end.scale**2
+    # The prior is one more observation, which errs as it says.
+    meat = (seen.rows * pull**2) @ seen.rows.T / end.scale**2 + jnp.diag(prior)
     return Polished(
         theta=end.theta,
         turn=end.turn,

@@ -14,7 +14,7 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, lengths, record, static
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart
+from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import FEWEST, by_shapes, members_of
 from jaxfuzzy.linalg import tangents
@@ -31,6 +31,7 @@ from jaxfuzzy.rivals import chosen_by_outline
 from jaxfuzzy.segment import Segmentation, segment
 from jaxfuzzy.shapes import Shape, fit_members, with_quadrics
 from jaxfuzzy.stereo import reconstruct
+from jaxfuzzy.vertical import agreed_vertical, upright_again, witness_of
 
 # Noise distance in standard deviations of a point along its viewing ray: farther points rather belong to noise.
 NOISE_SIGMAS = 2.5
@@ -201,7 +202,7 @@ def _model(
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
-    thickness, flat = 0.0, np.zeros(count, bool)
+    thickness, flat, supported = 0.0, np.zeros(count, bool), None
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
     along_ray = camera is not None and options.get("distance", "ray") == "ray"
     with compiling_ahead(OF_SCENE, points.dtype, along_ray):
@@ -213,6 +214,7 @@ def _model(
                 standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
                 kept &= np.asarray(standing.mask)
                 thickness, flat = float(standing.cut), np.asarray(standing.ground)
+                supported = found
                 plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
                 vertical = vertical if plane is None else np.asarray(plane.normal)
         if isinstance(noise_distance, str) and deviation is not None:
@@ -264,6 +266,12 @@ def _model(
         def as_kind(of: Sequence[int], kind: str) -> tuple[Shape, ...]:
             return in_independent_points(fitted([members[i] for i in of], kinds=(kind,)), OF_SCENE)
 
+        def stood(of: Sequence[int], kind: str, lean: float) -> tuple[Shape, ...]:
+            # The prior is weighed against all points that a fit counts, of which few are independent.
+            leans = [lean / np.sqrt(worth(len(members[i]), OF_SCENE) if correlated else 1.0) for i in of]
+            found = fitted([members[i] for i in of], kinds=(kind,), leans=leans)
+            return in_independent_points(found, OF_SCENE) if correlated else found
+
         correlated = cloud.pixels_px is not None and shape_rule != "paper"
         least = FEWEST_PIXELS if correlated else FEWEST
         shapes = fit(members)
@@ -281,6 +289,14 @@ def _model(
             if correlated:
                 depth = lengths(points - eye)
                 shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, mine, shapes)
+        if shape_rule != "paper":
+            given = not isinstance(up, str)
+            axis = np.asarray(vertical, float)
+            witness = witness_of(points, supported, axis, given=given, camera=eye, correlated=correlated)
+            agreed = agreed_vertical(shapes, witness)
+            if agreed is not None:
+                vertical = agreed.up
+                shapes = upright_again(shapes, agreed, stood)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)

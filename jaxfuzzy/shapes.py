@@ -178,6 +178,7 @@ def fit_members(
     rule: Literal["likelihood", "gric", "paper"] = "likelihood",
     weights: ArrayLike | None = None,
     capacity: int = 0,
+    leans: Sequence[float] | None = None,
 ) -> tuple[Shape, ...]:
     """The same for sets of points that may overlap.
 
@@ -193,6 +194,7 @@ def fit_members(
         weights: See there.
         capacity: Points that a set is fitted to at most; 0 to choose by the sets. Larger sets are fitted to a fair sample, and all
             their points judged.
+        leans: Standard deviation in radians with which the axis of each may lean from `up`; ten degrees by default.
     """
     array = checks.places(points)
     count = len(array)
@@ -216,6 +218,8 @@ def fit_members(
         else None
         for m in members
     ]
+    if leans is not None:
+        objects = [o and o._replace(lean=lean) for o, lean in zip(objects, leans, strict=True)]
     poor = [unfit(o) for o in objects]
     good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
     most = max((len(o.points) for o in good), default=1)

@@ -16,7 +16,7 @@ ORDER = """
     objects rays bounds starts local choice candidates screening finalists search polish fitting looks mostpoints quadrics
     shapes groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
-    outline pieces occlusion evidence rivals scene losses tuning sensitivity drawing plot export folder page report table
+    outline pieces occlusion evidence rivals vertical scene losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal
     cli __init__
 """.split()
