@@ -21,6 +21,7 @@ from jaxfuzzy.choice import HALF_LOG_2PI
 from jaxfuzzy.rays import Meeting, Residual, View
 
 MOST_STEPS = 120
+STIFFEST = 4.0
 # Below lie the last few points before a silhouette, where a surface bends away faster than a derivative tells.
 LEAST_DAMPING = 0.2
 MOST_LEVERAGE = 0.9
@@ -73,6 +74,8 @@ class _State(NamedTuple):
     background: Array
     met: Meeting
     look: _Look
+    wanted: Array
+    move: Array
     moved: Array
     last: Array
     done: Array
@@ -134,25 +137,31 @@ def polish(
         downhill = (seen.rows * seen.own) @ seen.error / scale**2 + prior * jnp.concatenate([jnp.zeros(5, dtype), lean])
         matrix = normal(theta, seen.rows, seen.own, scale)
         matrix = matrix + jnp.diag(1e-5 * jnp.diag(matrix))
-        move = jnp.clip(-starts.invert(matrix, downhill[:, None])[:, 0] * free, -0.2, 0.2)
-        move = jnp.where(still, 0.0, move)
+        wanted = jnp.clip(-starts.invert(matrix, downhill[:, None])[:, 0] * free, -0.2, 0.2)
+        wanted = jnp.where(still, 0.0, wanted)
+        # Derivatives are damped at grazing incidence, so that a step may be too long, and swing about for ever: the last one tells.
+        pull = matrix @ state.move
+        stiffness = pull @ (state.wanted - wanted) / jnp.maximum(pull @ state.move, 1e-30)
+        move = wanted / jnp.clip(stiffness, 1.0, STIFFEST)
         total = seen.own.sum()
         to_scale = jnp.clip(jnp.sqrt((seen.own * seen.square).sum() / (total + 1e-9)), *scale_bounds)
         to_background = jnp.clip(1 - total / count, 1e-3, 0.999)
         to_scale, to_background = jnp.where(still, scale, to_scale), jnp.where(still, background, to_background)
         # Noise and share matter to the parameters only through the weights: a hundredth as much.
         noise = jnp.maximum(jnp.abs(to_scale - scale), jnp.abs(to_background - background))
-        moved = jnp.where(still, state.moved, jnp.maximum(jnp.abs(move).max(), 0.01 * noise))
+        moved = jnp.where(still, state.moved, jnp.maximum(jnp.abs(wanted).max(), 0.01 * noise))
         theta, turn = theta + move[:5], starts.rotation(move[5], move[6]) @ turn
         met = met_by(family, theta, turn, candidate.detail, view)
         last = ~(moved > tolerance) | (state.step >= MOST_STEPS)
-        return _State(state.step + 1, theta, turn, to_scale, to_background, met, seen, moved, last, state.last)
+        return _State(
+            state.step + 1, theta, turn, to_scale, to_background, met, seen, wanted, move, moved, last, state.last
+        )
 
     blank, no = jnp.zeros_like(view.gain), jnp.asarray(False)
     nowhere = Meeting(blank[None], blank[None], blank[None].astype(jnp.int32))
     unseen = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank, blank)
-    far = jnp.asarray(jnp.inf, dtype)
-    start = _State(jnp.asarray(0), candidate.theta, turn, scale, background, nowhere, unseen, far, no, no)
+    far, nil = jnp.asarray(jnp.inf, dtype), jnp.zeros(7, dtype)
+    start = _State(jnp.asarray(0), candidate.theta, turn, scale, background, nowhere, unseen, nil, nil, far, no, no)
     end = lax.while_loop(lambda s: ~s.done, step, start)
     seen = end.look
     # ψ = own · e and its derivative, with d(own)/de = -own (1 - own) e / scale².

@@ -232,6 +232,15 @@ def test_noise_is_found_where_it_is_not_given(clouds):
         np.testing.assert_allclose(float(shape.noise_distance), SIGMAS * np.median(cloud.depth_std), rtol=0.2)
 
 
+def test_fits_come_to_rest():
+    # The first four swung between two places for ever while every step was as long as its damped derivatives say.
+    made = [simulate_object(KINDS[1 + i % 4], i, outliers=0.2) for i in (0, 1, 8, 13, 2, 3)]
+    points = np.concatenate([m.points for m in made])
+    labels = np.concatenate([np.full(len(m.points), i) for i, m in enumerate(made)])
+    found = fit_shapes(points, labels, camera=made[0].camera)
+    assert not any(int(shape.status) & Status.NOT_CONVERGED for shape in found)
+
+
 def test_points_with_their_own_deviations_count_by_them():
     cloud = simulate_object("cylinder", 60, outliers=0.0, flying=0.0, points=(1000, 1000))
     rng = np.random.default_rng(0)
