@@ -193,7 +193,8 @@ def _joined(
     view = None if camera is None or len(members) < 3 else _seen_from(camera, points, members)
     able_pairs = (p for p in apart if apart[p] < NEAR or (apart[p] < FAR and view is not None and _way_hidden(view, p)))
     pairs = sorted(able_pairs, key=apart.__getitem__)[:MOST_PAIRS]
-    both = [np.sort(np.concatenate([members[a], members[b]])) for a, b in pairs]
+    # Stable sorting takes advantage of each being in order already.
+    both = [np.sort(np.concatenate([members[a], members[b]]), kind="stable") for a, b in pairs]
     good: list[tuple[float, tuple[int, int], np.ndarray]] = []
     some = [_some(own) for own in both]
     for (a, b), of, own, shape in zip(pairs, some, both, fit(some, both) if both else (), strict=True):
@@ -390,32 +391,36 @@ def _rebuilt(
     labels = np.full(len(points), -1, np.int32)
     for i, (own, _, _) in enumerate(groups):
         labels[own] = i
-    columns, size, centers, spare = [], [], [], np.zeros(len(points), u.dtype)
+    # Columns are picked by a product, several times faster than by their indices; of those of one group the first is.
+    came_from = [k for *_, k in groups]
+    pick = np.zeros((u.shape[1], len(groups)), u.dtype)
+    for i, k in enumerate(came_from):
+        pick[k, i] = came_from.index(k) == i
+    memberships, noise = u @ pick, np.array(parts.partition.noise)
+    size, centers, spare = [], [], np.zeros(len(points) if into else 0, u.dtype)
     for i, (own, _, k) in enumerate(groups):
         sources = [k, *(b for b, a in into.items() if a == k)]
-        column = u[:, k]
         if len(sources) > 1:
             # Memberships add up for the points of a merged group; what that would give others stays where they belong.
             most, total, mine = u[:, sources].max(axis=1), u[:, sources].sum(axis=1), labels == i
-            column = np.where(mine, total, most)
+            memberships[:, i] = np.where(mine, total, most)
             spare += np.where(mine, 0, total - most)
-        siblings = [j for j, (_, _, other) in enumerate(groups) if other == k]
-        share = 1.0
-        if len(siblings) > 1:
+        siblings = [j for j, other in enumerate(came_from) if other == k]
+        share = len(own) / sum(len(groups[j][0]) for j in siblings)
+        if i != siblings[0]:
             # What has no label of its own stays with the first.
-            column = np.where(np.isin(labels, siblings), column * (labels == i), column * (i == siblings[0]))
-            share = len(own) / sum(len(groups[j][0]) for j in siblings)
-        columns.append(column)
+            memberships[own, i], memberships[own, siblings[0]] = u[own, k], 0
         size.append(share * sizes[sources].sum())
         centers.append(points[own].mean(axis=0))
-    memberships = np.stack(columns, axis=1).astype(u.dtype)
-    rows = np.flatnonzero(labels >= 0)
-    memberships[rows, labels[rows]] += spare[rows]
-    noise = np.asarray(parts.partition.noise) + np.where(labels < 0, spare, 0)
+    if into:
+        rows = np.flatnonzero(spare)
+        own, loose = rows[labels[rows] >= 0], rows[labels[rows] < 0]
+        memberships[own, labels[own]] += spare[own]
+        noise[loose] += spare[loose]
     # Points that a cut left out belong to noise.
-    lost = (labels < 0) & (np.asarray(parts.labels) >= 0)
-    noise = np.where(lost, noise + memberships.sum(axis=1), noise).astype(noise.dtype)
-    memberships = np.where(lost[:, None], 0, memberships)
+    lost = np.flatnonzero((labels < 0) & (np.asarray(parts.labels) >= 0))
+    noise[lost] += memberships[lost].sum(axis=1)
+    memberships[lost] = 0
     counts = np.array([len(own) for own, _, _ in groups], float)
     partition = dataclasses.replace(
         parts.partition,

@@ -120,7 +120,7 @@ def prepared(
         rays=ray,
         order=order,
         gain=gain,
-        typical=float(np.median(1 / gain)),
+        typical=_typical(gain),
         weight=weight,
         eye=eye,
         depth_range=max(float(np.ptp(depth)), 1e-6),
@@ -174,9 +174,14 @@ def with_more(
         rays=join(item.rays, ray),
         order=join(item.order, order),
         gain=gain,
-        typical=float(np.median(1 / gain)),
+        typical=_typical(gain),
         weight=join(item.weight, weight),
     )
+
+
+def _typical(gain: np.ndarray) -> float:
+    """The median deviation of an object's points, or of a fair sample of so many as are ever fitted."""
+    return float(np.median(1 / gain[:MOST]))
 
 
 def upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:

@@ -48,7 +48,9 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
         half = np.linalg.solve(root, np.linalg.solve(root, scatter).T)
         normal = np.linalg.solve(root.T, np.linalg.eigh((half + half.T) / 2)[1][:, 0])
         square = _squared_distances(embedded, slopes, normal, mean)
-    distance = np.sqrt(_squared_distances(*_terms(p), normal, mean)) / delta
+    # Piece by piece, as nine dimensions of all points and their derivatives are much to hold.
+    pieces = [_squared_distances(*_terms(p[i : i + MOST]), normal, mean) for i in range(0, len(p), MOST)]
+    distance = np.sqrt(np.concatenate(pieces)) / delta
     on, near = weights @ (distance <= 1), weights @ ((distance > 1) & (distance <= NEAR))
     if not np.isfinite(distance).all() or on < LEAST * weights.sum() or near > BEYOND * (near + on):
         return None
