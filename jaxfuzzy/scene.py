@@ -61,7 +61,8 @@ class Scene:
 
     Attributes:
         cloud: The points.
-        up: The vertical direction, a unit vector that points up.
+        up: The vertical direction, a unit vector that points up: the one given, or the supporting plane's normal refined on the
+            objects (see `vertical`).
         ground: The supporting plane, if one was found.
         segmentation: The objects; its labels are those of all points of the cloud, -1 for ground, walls and outliers.
         shapes: One shape an object, in the order of the labels 0, 1, ...
