@@ -63,7 +63,8 @@ SENTENCES: dict[Status, str] = {
     Status.PAPER_DISAGREES: "The paper's most-points rule names another kind than the distance to the surface does.",
     Status.MAY_BE_BOX: "A single flat face: it may be one side of a box whose other sides were not seen.",
     Status.LOWER_BOUND: "An extent was not seen to its end: the size given is a lower bound.",
-    Status.NO_GROUND: "No supporting plane was found: the camera's own frame was used, or the vertical objects agree on; give up=(x, y, z) if you know it.",
+    Status.NO_GROUND: "No supporting plane was found: the camera's own frame was used, or the vertical that objects agree on;"
+    " give up=(x, y, z) if you know it.",
     Status.GROUND_SLAB: "The supporting plane's residual is larger than the depth noise: it may be a slab through clutter.",
     Status.ARBITRARY_UNITS: "The rig has no known baseline or offset: lengths are in arbitrary units.",
     Status.MISALIGNED: "Rows of the two images do not match: rectify the pair or check the calibration.",
