@@ -12,7 +12,15 @@ from jaxfuzzy.primitives import Box, Cylinder, Sphere
 from jaxfuzzy.render import render_pair, table_scene
 from jaxfuzzy.simulate import simulate_scene
 from jaxfuzzy.status import Status
-from jaxfuzzy.vertical import LEAST_LEAN, NOISE_DISTANCE, Witness, agreed_vertical, witness_of
+from jaxfuzzy.vertical import (
+    LEAST_LEAN,
+    NOISE_DISTANCE,
+    Vertical,
+    Witness,
+    agreed_vertical,
+    upright_again,
+    witness_of,
+)
 from synthetic import fitted_shape
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -112,6 +120,26 @@ def test_doubtful_fits_and_bodies_without_an_axis_do_not_count():
     found = agreed_vertical([doubtful, *good, loose, ball, unknown], ground(0.3))
     assert found.upright == [1, 2, 3]
     np.testing.assert_array_equal(found.up, agreed_vertical(good, ground(0.3)).up)
+
+
+def test_what_cannot_stand_stays_as_it_was():
+    old = [dataclasses.replace(standing((x, 0.0)), scores={"cylinder": 1.0}) for x in (0.5, 1.0, 1.5, 30.0)]
+    again = [standing((0.1, 0.0)), dataclasses.replace(old[1], kind="unknown", primitive=None), standing((0.2, 0.0))]
+    again[0] = dataclasses.replace(again[0], scores={}, status=jnp.asarray(int(Status.NOT_CONVERGED)))
+    again[2] = dataclasses.replace(again[2], inliers=jnp.arange(1000) < 700)
+    asked = []
+
+    def fit(of, kind, lean):
+        asked.append((list(of), kind, lean))
+        return again
+
+    new = upright_again(old, Vertical(UP, 0.003, 0.004, [0, 1, 2]), fit)
+    assert asked == [([0, 1, 2], "cylinder", pytest.approx(0.005))]
+    assert new[0].primitive is again[0].primitive
+    assert new[0].scores == {"cylinder": 1.0}
+    assert int(new[0].status) == Status.NOT_CONVERGED
+    # Refused about the vertical, holding too few of its points there, never upright.
+    assert [new[i] is old[i] for i in (1, 2, 3)] == [True] * 3
 
 
 def test_error_of_a_plane_is_that_of_its_points():
