@@ -81,7 +81,7 @@ def part(
     held, background = _survey(places, weights, box, bandwidth)
     for most in PROTOTYPES:
         tiling = _tile(places, weights, held, background, bandwidth, most=most)
-        if not bool(tiling.real[-1]):
+        if not np.asarray(tiling.real)[-1]:
             return _divide(places, weights, box, bandwidth, tiling, allowed)
     return None
 

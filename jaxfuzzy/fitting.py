@@ -149,7 +149,11 @@ def _judge(
 
 
 # Run once a call on a few numbers: optimising the code takes longer than it saves.
-@partial(jax.jit, static_argnames="kind", compiler_options={"xla_backend_optimization_level": 0})
+@partial(
+    jax.jit,
+    static_argnames="kind",
+    compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
+)
 def assemble_batch(
     kind: str, theta: Array, covariance: Array, turn: Array, detail: Array, ends: Array, frame: Frame
 ) -> tuple[Primitive, Array]:

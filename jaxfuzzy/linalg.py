@@ -31,6 +31,7 @@ def normalised(vectors: Array, axis: int = -1) -> Array:
     return divide(vectors, jnp.expand_dims(norm(vectors, axis), axis))
 
 
+@jax.jit
 def tangents(axis: Array) -> Array:
     """Two unit vectors (2, 3) that make a right-handed frame with a unit vector (3,); smooth but for a jump at z = 0.
 
