@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from jaxfuzzy.choice import SLOPES
+from jaxfuzzy.choice import FLATTEST, SLOPES
 from jaxfuzzy.fitting import Fitted, fit_batch
 from jaxfuzzy.objects import DEVIATIONS, Prepared, batches, prepared, stacked, with_more
 from jaxfuzzy.search import KINDS, MORE
@@ -49,6 +49,7 @@ UNDERRATED, OVERRATED, MOST_LOOKS = 1.3, 0.5, 4
 # Sine of the angle from which on two normals tell an axis, and of the error of a normal; and the share that must agree on one: of
 # lying cylinders in photographs 0.75 and more, of blobs among outliers 0.54 and less.
 APART, SLANT, AGREE = 0.3, 0.1, 0.65
+ROUND = ("cylinder", "cone", "sphere")
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
 
@@ -200,18 +201,23 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
     # Batches of one compiled size; two for each processor, since some take longer than others.
     few = batches(range(len(items)), 2 * (os.cpu_count() or 1))
     looks = [found for batch in side_by_side(fit, few) for found in batch]
-    # A cone that the last polish took all narrowing from is none.
-    straight = [i for i, found in enumerate(looks) if _straight(found)]
-    others = settings._replace(kinds=tuple(k for k in settings.kinds if k != "cone"))
-    again = _search([items[i] for i in straight], others, [looks[i].expected for i in straight])
-    for i, found in zip(straight, again, strict=True):
-        looks[i] = found
+    # What the last polish took out of shape is of another kind.
+    worn = [KINDS[found.fitted.kind] if _worn(found) else "" for found in looks]
+    for kind in sorted(set(worn) - {""}):
+        own = [i for i, name in enumerate(worn) if name == kind]
+        others = settings._replace(kinds=tuple(k for k in settings.kinds if k != kind))
+        again = _search([items[i] for i in own], others, [looks[i].expected for i in own])
+        for i, found in zip(own, again, strict=True):
+            looks[i] = found
     return looks
 
 
-def _straight(look: Look) -> bool:
-    p = look.fitted.polished
-    return KINDS[look.fitted.kind] == "cone" and bool(look.fitted.passed.any()) and not SLOPES[0] < abs(p.theta[3])
+def _worn(look: Look) -> bool:
+    """Whether the last polish took all narrowing from a cone, or the bend from what is round."""
+    kind, theta = KINDS[look.fitted.kind], look.fitted.polished.theta
+    straight = kind == "cone" and not SLOPES[0] < abs(theta[3])
+    flat = kind in ROUND and not theta[3 if kind == "sphere" else 2] < FLATTEST
+    return bool(look.fitted.passed.any()) and (straight or flat)
 
 
 def _reason(look: Look) -> Status:

@@ -17,11 +17,12 @@ from jax import lax
 from jaxfuzzy import rays, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.candidates import Candidates
-from jaxfuzzy.choice import HALF_LOG_2PI
+from jaxfuzzy.choice import FLATTEST, HALF_LOG_2PI
 from jaxfuzzy.rays import Meeting, Residual, View
 
 MOST_STEPS = 120
-STIFFEST = 4.0
+# A step is so many times what derivatives say at least, and at most; where even the least is too long, points change sides.
+STIFFEST, SOFTEST = 4.0, 0.3
 # Below lie the last few points before a silhouette, where a surface bends away faster than a derivative tells.
 LEAST_DAMPING = 0.2
 MOST_LEVERAGE = 0.9
@@ -76,6 +77,7 @@ class _State(NamedTuple):
     look: _Look
     wanted: Array
     move: Array
+    calm: Array
     moved: Array
     last: Array
     done: Array
@@ -139,29 +141,38 @@ def polish(
         matrix = matrix + jnp.diag(1e-5 * jnp.diag(matrix))
         wanted = jnp.clip(-starts.invert(matrix, downhill[:, None])[:, 0] * free, -0.2, 0.2)
         wanted = jnp.where(still, 0.0, wanted)
-        # Derivatives are damped at grazing incidence, so that a step may be too long, and swing about for ever: the last one tells.
+        # Derivatives are damped at grazing incidence and know nothing of weights, so that steps would swing about for ever, or
+        # creep: how far the last one led tells how long this one is to be (Barzilai and Borwein, IMA J. Numer. Anal. 8, 1988).
+        # Across an edge where points change from face to face no step is short enough: they grow shorter and come to rest on it.
         pull = matrix @ state.move
-        stiffness = pull @ (state.wanted - wanted) / jnp.maximum(pull @ state.move, 1e-30)
-        move = wanted / jnp.clip(stiffness, 1.0, STIFFEST)
+        went = pull @ state.move
+        stiffness = jnp.where(went > 0, pull @ (state.wanted - wanted) / jnp.where(went > 0, went, 1.0), 1.0)
+        calm = jnp.where(stiffness > STIFFEST, 2.0, 0.8) * state.calm
+        calm = jnp.where(still, 1.0, jnp.maximum(calm, 1.0))
+        move = wanted / (jnp.clip(stiffness, SOFTEST, STIFFEST) * calm)
         total = seen.own.sum()
         to_scale = jnp.clip(jnp.sqrt((seen.own * seen.square).sum() / (total + 1e-9)), *scale_bounds)
         to_background = jnp.clip(1 - total / count, 1e-3, 0.999)
         to_scale, to_background = jnp.where(still, scale, to_scale), jnp.where(still, background, to_background)
         # Noise and share matter to the parameters only through the weights: a hundredth as much.
         noise = jnp.maximum(jnp.abs(to_scale - scale), jnp.abs(to_background - background))
-        moved = jnp.where(still, state.moved, jnp.maximum(jnp.abs(wanted).max(), 0.01 * noise))
+        moved = jnp.where(still, state.moved, jnp.maximum(jnp.abs(wanted).max() / calm, 0.01 * noise))
         theta, turn = theta + move[:5], starts.rotation(move[5], move[6]) @ turn
         met = met_by(family, theta, turn, candidate.detail, view)
-        last = ~(moved > tolerance) | (state.step >= MOST_STEPS)
+        # What grows without end is flat.
+        radius = jnp.where(family == SPHERE, theta[3], jnp.where(family == REVOLUTION, theta[2], 0.0))
+        last = ~(moved > tolerance) | (state.step >= MOST_STEPS) | (radius > FLATTEST)
         return _State(
-            state.step + 1, theta, turn, to_scale, to_background, met, seen, wanted, move, moved, last, state.last
+            state.step + 1, theta, turn, to_scale, to_background, met, seen, wanted, move, calm, moved, last, state.last
         )
 
     blank, no = jnp.zeros_like(view.gain), jnp.asarray(False)
     nowhere = Meeting(blank[None], blank[None], blank[None].astype(jnp.int32))
     unseen = _Look(jnp.zeros((7, len(blank)), dtype), blank, blank, blank, blank)
     far, nil = jnp.asarray(jnp.inf, dtype), jnp.zeros(7, dtype)
-    start = _State(jnp.asarray(0), candidate.theta, turn, scale, background, nowhere, unseen, nil, nil, far, no, no)
+    start = _State(
+        jnp.asarray(0), candidate.theta, turn, scale, background, nowhere, unseen, nil, nil, 1 + blank[0], far, no, no
+    )
     end = lax.while_loop(lambda s: ~s.done, step, start)
     seen = end.look
     # ψ = own · e and its derivative, with d(own)/de = -own (1 - own) e / scale².

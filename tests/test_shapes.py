@@ -387,6 +387,22 @@ def test_a_cone_that_the_last_polish_made_straight_is_none(slope, kind, monkeypa
     assert kind == "cone" or any(guard.startswith("cone: it does not taper") for guard in shape.guards)
 
 
+@pytest.mark.parametrize(("radius", "kind"), [(5.0, "cylinder"), (0.5, "sphere")])
+def test_a_sphere_that_the_last_polish_made_flat_is_none(radius, kind, monkeypatch):
+    search = looks.fit_batch
+
+    def spheres_first(batch, allowed, *options):
+        fitted = search(batch, allowed, *options)
+        if not allowed[4]:
+            return fitted
+        theta = fitted.polished.theta.at[:, 3].set(radius)
+        return fitted._replace(kind=jnp.full_like(fitted.kind, 4), polished=fitted.polished._replace(theta=theta))
+
+    made = simulate_object("cylinder", 3, points=(900, 901))
+    monkeypatch.setattr(looks, "fit_batch", spheres_first)
+    assert fit_shape(made.points, camera=made.camera, noise_distance=2.5 * made.depth_std).kind == kind
+
+
 def test_an_axis_is_square_to_most_normals_though_a_third_are_of_edges():
     rng = np.random.default_rng(0)
     truth = np.array([0.6, 0.0, 0.8])
