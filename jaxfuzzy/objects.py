@@ -214,12 +214,8 @@ def stacked(items: Sequence[Prepared], capacity: int, dtype: Any) -> dict[str, n
         n = min(len(o.points), capacity)
         batch["points"][i, :, :n], batch["rays"][i, :, :n] = o.points[:n].T, o.rays[:n].T
         batch["gain"][i, :n], batch["weight"][i, :n] = o.gain[:n], o.weight[:n]
-        batch["eye"][i], batch["depth_range"][i], batch["given"][i], batch["lean"][i] = (
-            o.eye,
-            o.depth_range,
-            o.given,
-            o.lean,
-        )
+        batch["eye"][i], batch["depth_range"][i] = o.eye, o.depth_range
+        batch["given"][i], batch["lean"][i] = o.given, o.lean
     return batch
 
 
