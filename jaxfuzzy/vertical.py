@@ -188,7 +188,7 @@ def _lean_of(shape: Shape, up: np.ndarray, across: np.ndarray) -> tuple[np.ndarr
     if isinstance(primitive, Box):
         axes = np.asarray(primitive.axes, float)
         axis = axes[np.argmax(np.abs(axes @ up))]
-        # A small rotation w moves an axis by w x axis.
+        # A small rotation w moves an axis by w x axis. The rotation vector's errors are taken for such: only weights hang on them.
         slope = np.cross(np.eye(3), axis).T
         part = slice(6, 9)
     else:

@@ -369,38 +369,26 @@ def test_threads_compute_in_the_precision_of_the_one_that_asks(double):
         assert pool.submit(lambda: jnp.ones(1).dtype).result() == jnp.ones(1).dtype
 
 
-@pytest.mark.parametrize(("slope", "kind"), [(0.01, "cylinder"), (0.2, "cone")])
-def test_a_cone_that_the_last_polish_made_straight_is_none(slope, kind, monkeypatch):
-    search = looks.fit_batch
+@pytest.mark.parametrize(
+    ("first", "polished", "kind"),
+    [("cone", 0.01, "cylinder"), ("cone", 0.2, "cone"), ("sphere", 5.0, "cylinder"), ("sphere", 0.5, "sphere")],
+)
+def test_what_the_last_polish_took_out_of_shape_is_none(first, polished, kind, monkeypatch):
+    # A cone by its narrowing, a sphere by its radius: both are the fourth parameter.
+    search, index = looks.fit_batch, KINDS.index(first)
 
-    def cones_first(batch, allowed, *options):
+    def found_first(batch, allowed, *options):
         fitted = search(batch, allowed, *options)
-        if not allowed[3]:
+        if not allowed[index]:
             return fitted
-        theta = fitted.polished.theta.at[:, 3].set(slope)
-        return fitted._replace(kind=jnp.full_like(fitted.kind, 3), polished=fitted.polished._replace(theta=theta))
+        theta = fitted.polished.theta.at[:, 3].set(polished)
+        return fitted._replace(kind=jnp.full_like(fitted.kind, index), polished=fitted.polished._replace(theta=theta))
 
     made = simulate_object("cylinder", 3, points=(900, 901))
-    monkeypatch.setattr(looks, "fit_batch", cones_first)
+    monkeypatch.setattr(looks, "fit_batch", found_first)
     shape = fit_shape(made.points, camera=made.camera, noise_distance=2.5 * made.depth_std)
     assert shape.kind == kind
-    assert kind == "cone" or any(guard.startswith("cone: it does not taper") for guard in shape.guards)
-
-
-@pytest.mark.parametrize(("radius", "kind"), [(5.0, "cylinder"), (0.5, "sphere")])
-def test_a_sphere_that_the_last_polish_made_flat_is_none(radius, kind, monkeypatch):
-    search = looks.fit_batch
-
-    def spheres_first(batch, allowed, *options):
-        fitted = search(batch, allowed, *options)
-        if not allowed[4]:
-            return fitted
-        theta = fitted.polished.theta.at[:, 3].set(radius)
-        return fitted._replace(kind=jnp.full_like(fitted.kind, 4), polished=fitted.polished._replace(theta=theta))
-
-    made = simulate_object("cylinder", 3, points=(900, 901))
-    monkeypatch.setattr(looks, "fit_batch", spheres_first)
-    assert fit_shape(made.points, camera=made.camera, noise_distance=2.5 * made.depth_std).kind == kind
+    assert kind == first or any(guard.startswith(f"{first}: it") for guard in shape.guards)
 
 
 def test_an_axis_is_square_to_most_normals_though_a_third_are_of_edges():
