@@ -1,10 +1,10 @@
 """The winner on all points: Gauss-Newton steps under mixture memberships until it stands still, and its covariance.
 
-The axis is free to lean, with a prior. Weights
-are the probabilities of belonging to the surface; they fall off for good points too, which the plain inverse normal matrix
-does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with H = Σ ψ' J Ĵᵀ (Huber, Robust Statistics, 1981), J
-the derivatives that steps take and Ĵ the true ones: along a ray that grazes the surface the former are damped. In ψ² a residual
-counts as if its point had not pulled the surface towards itself (HC3; MacKinnon and White, J. Econometrics 29, 1985).
+The axis is free to lean, with a prior. Weights are the probabilities of belonging to the surface; they fall off for good points
+too, which the plain inverse normal matrix does not know. The covariance is therefore the sandwich H⁻¹ (Σ ψ² J Jᵀ) H⁻¹ with
+H = Σ ψ' J Ĵᵀ (Huber, Robust Statistics, 1981), J the derivatives that steps take and Ĵ the true ones: along a ray that grazes the
+surface the former are damped. In ψ² a residual counts as if its point had not pulled the surface towards itself (HC3; MacKinnon
+and White, J. Econometrics 29, 1985).
 """
 
 from collections.abc import Callable
@@ -18,6 +18,7 @@ from jaxfuzzy import rays, starts
 from jaxfuzzy.arrays import Array
 from jaxfuzzy.candidates import Candidates
 from jaxfuzzy.choice import FLATTEST, HALF_LOG_2PI
+from jaxfuzzy.linalg import divide
 from jaxfuzzy.rays import Meeting, Residual, View
 
 MOST_STEPS = 120
@@ -66,7 +67,10 @@ class _Look(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Where the surface is; `look` is at where it was a step before, `last` says that it rests, `done` that it was seen there."""
+    """Where the surface is; `look` is at where it was a step before, `last` says that it rests, `done` that it was seen there.
+
+    Of the last step: `wanted` is what derivatives asked for, `move` what was done, `calm` how many times shorter steps are made.
+    """
 
     step: Array
     theta: Array
@@ -135,8 +139,10 @@ def polish(
         # At the first look nothing is known yet of where rays meet the surface; the last is at where it came to rest.
         still = (state.step == 0) | state.last
         seen = look(state)
-        lean = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[1, 0] - turn[0, 1]])
-        downhill = (seen.rows * seen.own) @ seen.error / scale**2 + prior * jnp.concatenate([jnp.zeros(5, dtype), lean])
+        leaning = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[1, 0] - turn[0, 1]])
+        downhill = (seen.rows * seen.own) @ seen.error / scale**2 + prior * jnp.concatenate(
+            [jnp.zeros(5, dtype), leaning]
+        )
         matrix = normal(theta, seen.rows, seen.own, scale)
         matrix = matrix + jnp.diag(1e-5 * jnp.diag(matrix))
         wanted = jnp.clip(-starts.invert(matrix, downhill[:, None])[:, 0] * free, -0.2, 0.2)
@@ -145,8 +151,7 @@ def polish(
         # creep: how far the last one led tells how long this one is to be (Barzilai and Borwein, IMA J. Numer. Anal. 8, 1988).
         # Across an edge where points change from face to face no step is short enough: they grow shorter and come to rest on it.
         pull = matrix @ state.move
-        went = pull @ state.move
-        stiffness = jnp.where(went > 0, pull @ (state.wanted - wanted) / jnp.where(went > 0, went, 1.0), 1.0)
+        stiffness = divide(pull @ (state.wanted - wanted), pull @ state.move, 1.0)
         calm = jnp.where(stiffness > STIFFEST, 2.0, 0.8) * state.calm
         calm = jnp.where(still, 1.0, jnp.maximum(calm, 1.0))
         move = wanted / (jnp.clip(stiffness, SOFTEST, STIFFEST) * calm)

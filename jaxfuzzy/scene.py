@@ -203,7 +203,7 @@ def _model(
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
-    thickness, flat, supported = 0.0, np.zeros(count, bool), None
+    thickness, flat, found = 0.0, np.zeros(count, bool), None
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
     along_ray = camera is not None and options.get("distance", "ray") == "ray"
     with compiling_ahead(OF_SCENE, points.dtype, along_ray):
@@ -215,7 +215,6 @@ def _model(
                 standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
                 kept &= np.asarray(standing.mask)
                 thickness, flat = float(standing.cut), np.asarray(standing.ground)
-                supported = found
                 plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
                 vertical = vertical if plane is None else np.asarray(plane.normal)
         if isinstance(noise_distance, str) and deviation is not None:
@@ -293,7 +292,7 @@ def _model(
         if shape_rule != "paper":
             given = not isinstance(up, str)
             axis = np.asarray(vertical, float)
-            witness = witness_of(points, supported, axis, given=given, camera=eye, correlated=correlated)
+            witness = witness_of(points, found, axis, given=given, camera=eye, correlated=correlated)
             agreed = agreed_vertical(shapes, witness)
             if agreed is not None:
                 vertical = agreed.up

@@ -19,6 +19,7 @@ import numpy as np
 from jaxfuzzy.evidence import PIXELS_PER_POINT
 from jaxfuzzy.ground import Ground
 from jaxfuzzy.linalg import tangents
+from jaxfuzzy.planes import deviation_across, noise_of
 from jaxfuzzy.primitives import Box, Cone, Cylinder
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -137,10 +138,7 @@ def witness_of(
     up = np.asarray(ground.plane.normal, float)
     on = np.asarray(ground.inliers)
     x, std = points[on].astype(float), np.asarray(ground.depth_std, float)[on]
-    if camera is not None:
-        ray = x - camera
-        std = std * np.abs(ray @ up) / np.linalg.norm(ray, axis=1)
-    level = (x - x.mean(0)) @ _tangents(up).T / np.maximum(std, 1e-12)[:, None]
+    level = (x - x.mean(0)) @ _tangents(up).T / deviation_across(up, *noise_of(x, std, camera))[:, None]
     information = level.T @ level / (PIXELS_PER_POINT if correlated else 1)
     error = np.linalg.inv(information + np.eye(2) / GUESS_ERROR**2) + PLANE_ERROR**2 * np.eye(2)
     return Witness(up, error, bool(int(ground.status) & Status.GROUND_SLAB))
