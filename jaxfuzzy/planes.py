@@ -8,7 +8,7 @@ prior on its angle.
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from jaxfuzzy.arrays import Array, Bool, Float, Int, lengths, record
-from jaxfuzzy.linalg import tangents
+from jaxfuzzy.linalg import normalised, tangents
 
 # Patches along each side of the view. 24 leaves a patch of a 450 x 375 image some 19 x 16 pixels: over that, a standing
 # surface runs through a lying plane by several deviations of a stereo match, and a strip of board between cones fills some.
@@ -29,6 +29,9 @@ OFFSETS, BINS = 4, 48
 PATCH_DELTA, POINT_DELTA = 1.0, 2.5
 # Sideways deviation of a point over the one along its ray: keeps grazing planes from becoming infinitely thin.
 SIDEWAYS = 0.1
+# Coordinates of the products that make a scatter, how often each stands in it, and how often cofactors are squared.
+PAIRS, TWICE = np.triu_indices(3), np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0], np.float32)
+SQUARINGS = 5
 
 
 @record
@@ -89,121 +92,164 @@ class Candidate:
 @jax.jit
 def fit_plane(view: View, prior: Prior, scale: Float[Array, ""]) -> Candidate:
     """The best plane of a view; `scale` multiplies every standard deviation."""
-    mean, scatter, weight, ray, floor = _patches(view)
-    ray, floor = scale * ray, scale * floor
+    patches, middle = _patches(view)
+    patches = patches._replace(ray=scale * patches.ray, floor=scale * patches.floor)
+    weight = patches.weight
 
-    def deviation2(normal: Array, rays: Array, floors: Array) -> Array:
-        return (rays @ normal) ** 2 + floors**2
-
-    def distances(normal: Array, offset: Array) -> Array:
-        """Mean squared distance of each patch's points, in variances."""
-        through = jnp.einsum("pij,i,j->p", scatter, normal, normal)
-        return ((mean @ normal - offset) ** 2 + through) / deviation2(normal, ray, floor)
-
-    def step(plane: tuple[Array, Array], delta: Array) -> tuple[tuple[Array, Array], None]:
+    def step(planes: tuple[Array, Array], delta: Array) -> tuple[tuple[Array, Array], None]:
         # One variety and noise, m = 2: u = 1 / (1 + D / delta^2) is eq. 20, u^2 weighs the scatter of eq. 16.
-        normal, offset = plane
-        u2 = weight / (1 + distances(normal, offset) / delta**2) ** 2 / deviation2(normal, ray, floor)
-        return _smallest_direction(u2, mean, normal, scatter), None
+        gap, through, variance = _apart(patches, *planes)
+        u2 = weight / (1 + (gap**2 + through) / variance / delta**2) ** 2 / variance
+        return _smallest_directions(u2, patches, planes[0]), None
 
-    def anneal(normal: Array, offset: Array) -> tuple[Array, Array]:
-        deltas = PATCH_DELTA * jnp.concatenate([4 * 0.8 ** jnp.arange(6.0), jnp.ones(4)]).astype(mean.dtype)
-        return lax.scan(step, (normal, offset), deltas)[0]
-
-    def judge(normal: Array, offset: Array) -> tuple[Array, Array, Array, Array]:
-        u = weight / (1 + distances(normal, offset) / PATCH_DELTA**2)
-        residual = (mean @ normal - offset) / jnp.sqrt(deviation2(normal, ray, floor))
+    def judge(normal: Array, offset: Array, u: Array, residual: Array, within: Array) -> tuple[Array, Array, Array]:
         above, below = (weight * (residual > 3)).sum(), (weight * (residual < -3)).sum()
-        seen_from = prior.eye[:3] @ normal - offset
+        seen_from = (prior.eye[:3] - middle) @ normal - offset
         side = jnp.where(jnp.where(prior.eye[3] > 0, seen_from, above - below) < 0, -1, 1)
-        outline = jnp.where(prior.anywhere, 1, _within(u))
+        outline = jnp.where(prior.anywhere, 1, within)
         hidden = jnp.where(side * residual < -3, weight * outline, 0).sum()
         center, deviation, largest = prior.angle
         angle = jnp.arccos(jnp.clip(jnp.abs(normal @ prior.axis), 0, 1)) - center
         support = (u.sum() - hidden) / weight.sum()
         score = jnp.where(support > 0, support * jnp.exp(-0.5 * (angle / deviation) ** 2), support)
-        return jnp.where(jnp.abs(angle) <= largest, score, -jnp.inf), support, side, u
+        return jnp.where(jnp.abs(angle) <= largest, score, -jnp.inf), support, side
 
-    offsets = jax.vmap(lambda n: _offsets(mean, weight, distances, n))(prior.starts)
-    normals, offsets = jax.vmap(anneal)(jnp.repeat(prior.starts, OFFSETS, axis=0), offsets.ravel())
-    scores, supports, sides, shares = jax.vmap(judge)(normals, offsets)
+    starts = jnp.repeat(prior.starts, OFFSETS, axis=0), _offsets(patches, prior.starts).ravel()
+    deltas = PATCH_DELTA * jnp.concatenate([4 * 0.8 ** jnp.arange(6.0), jnp.ones(4)]).astype(middle.dtype)
+    (normals, offsets), _ = lax.scan(step, starts, deltas)
+    gap, through, variance = _apart(patches, normals, offsets)
+    shares = weight / (1 + (gap**2 + through) / variance / PATCH_DELTA**2)
+    residuals = gap * lax.rsqrt(variance)
+    scores, supports, sides = jax.vmap(judge)(normals, offsets, shares, residuals, _within(shares))
     best = jnp.argmax(scores)
     normal, offset = sides[best] * normals[best], sides[best] * offsets[best]
 
     # Finish on the points of the patches that belong to it.
-    rays, floors, points = scale * view.ray, scale * view.floor, view.points
+    rays, floors, points = scale * view.ray, scale * view.floor, view.points - middle
     trust = view.weights * (shares[best] / jnp.maximum(weight, 1e-9))[view.patch]
 
     def finish(plane: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         normal, offset = plane
-        variance = deviation2(normal, rays, floors)
+        variance = (rays @ normal) ** 2 + floors**2
         u2 = trust / (1 + (points @ normal - offset) ** 2 / variance / POINT_DELTA**2) ** 2 / variance
         return _smallest_direction(u2, points, normal), None
 
     (normal, offset), _ = lax.scan(finish, (normal, offset), length=6)
-    residual = jnp.abs(points @ normal - offset) / jnp.sqrt(deviation2(normal, rays, floors))
+    residual = jnp.abs(points @ normal - offset) * lax.rsqrt((rays @ normal) ** 2 + floors**2)
     # The median of |residual| of a normal deviation of 1 is 0.6745; what is further than 5 belongs to something else.
     spread = _weighted_median(residual, jnp.where(residual < 5, trust, 0)) / 0.6745
     support = jnp.where(scores[best] == -jnp.inf, -1, supports[best])
-    return Candidate(normal, offset, support, spread)
+    return Candidate(normal, offset + middle @ normal, support, spread)
 
 
-def _smallest_direction(
-    weights: Array, points: Array, toward: Array, scatter: Array | None = None
-) -> tuple[Array, Array]:
+class _Patches(NamedTuple):
+    """Means (P, 3) about the middle of all, scatters (P, 6) as `PAIRS` has them, weights (P,), rays (P, 3) and floors (P,)."""
+
+    mean: Array
+    scatter: Array
+    weight: Array
+    ray: Array
+    floor: Array
+
+
+def _apart(patches: _Patches, normals: Array, offsets: Array) -> tuple[Array, Array, Array]:
+    """Of planes (S, 3), (S,) and patches: distance, mean square of a patch's points about it, and its variance (S, P) each."""
+    through = (normals[:, PAIRS[0]] * normals[:, PAIRS[1]] * TWICE) @ patches.scatter.T
+    return normals @ patches.mean.T - offsets[:, None], through, (normals @ patches.ray.T) ** 2 + patches.floor**2
+
+
+def _smallest_directions(weights: Array, patches: _Patches, toward: Array) -> tuple[Array, Array]:
+    """For weights (S, P) the same as `_smallest_direction`, from moments that one product gives.
+
+    The eigenvector of the smallest eigenvalue is that of the largest one of the cofactors, found by squaring them.
+    """
+    mean = patches.mean
+    moments = jnp.concatenate(
+        [jnp.ones_like(mean[:, :1]), mean, patches.scatter + mean[:, PAIRS[0]] * mean[:, PAIRS[1]]], 1
+    )
+    total = weights @ moments
+    total = total / jnp.maximum(total[:, :1], jnp.finfo(mean.dtype).tiny)
+    center = total[:, 1:4]
+    xx, xy, xz, yy, yz, zz = (total[:, 4:] - center[:, PAIRS[0]] * center[:, PAIRS[1]]).T
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    power = jnp.moveaxis(jnp.stack([jnp.stack([a, b, c]), jnp.stack([b, d, e]), jnp.stack([c, e, f])]), -1, 0)
+    for _ in range(SQUARINGS):
+        power = power / jnp.maximum(jnp.trace(power, axis1=1, axis2=2), jnp.finfo(mean.dtype).tiny)[:, None, None]
+        power = (power[:, :, :, None] * power[:, None]).sum(2)
+    column = jnp.argmax(jnp.diagonal(power, axis1=1, axis2=2), axis=1)
+    normal = jnp.take_along_axis(power, column[:, None, None], axis=2)[..., 0]
+    normal = normalised(normal * lax.rsqrt(jnp.abs(normal).max(1, keepdims=True) + jnp.finfo(mean.dtype).tiny))
+    normal = jnp.where((normal != 0).any(1, keepdims=True), normal, toward)
+    normal = normal * jnp.where((normal * toward).sum(1, keepdims=True) < 0, -1, 1)
+    return normal, (normal * center).sum(1)
+
+
+def _smallest_direction(weights: Array, points: Array, toward: Array) -> tuple[Array, Array]:
     """Normal and offset of the plane of least weighted squared distance; of the two signs, the one near `toward`."""
     weights = weights / jnp.maximum(weights.sum(), jnp.finfo(points.dtype).tiny)
     mean = weights @ points
     centred = points - mean
-    moments = (centred * weights[:, None]).T @ centred
-    if scatter is not None:
-        moments = moments + jnp.einsum("p,pij->ij", weights, scatter)
-    normal = jnp.linalg.eigh(moments)[1][:, 0]
+    normal = jnp.linalg.eigh((centred * weights[:, None]).T @ centred)[1][:, 0]
     normal = normal * jnp.where(normal @ toward < 0, -1, 1)
     return normal, normal @ mean
 
 
-def _offsets(mean: Array, weight: Array, distances: Any, normal: Array) -> Array:
-    """The offsets along a direction where most patches lie, out of evenly spaced ones."""
-    height = mean @ normal
-    low = jnp.min(jnp.where(weight > 0, height, jnp.inf))
-    high = jnp.max(jnp.where(weight > 0, height, -jnp.inf))
-    offsets = low + (high - low) * (jnp.arange(BINS) + 0.5) / BINS
-    held = jax.vmap(lambda o: (weight / (1 + distances(normal, o) / (4 * PATCH_DELTA) ** 2)).sum())(offsets)
-    padded = jnp.pad(held, 1, constant_values=-1)
-    peak = (held >= padded[:-2]) & (held > padded[2:])
-    return offsets[lax.top_k(jnp.where(peak, held, -1), OFFSETS)[1]]
+def _offsets(patches: _Patches, normals: Array) -> Array:
+    """Along directions (S, 3) the offsets (S, OFFSETS) where most patches lie, out of evenly spaced ones."""
+    weight = patches.weight
+    height, through, variance = _apart(patches, normals, jnp.zeros_like(normals[:, 0]))
+    low = jnp.min(jnp.where(weight > 0, height, jnp.inf), axis=1, keepdims=True)
+    high = jnp.max(jnp.where(weight > 0, height, -jnp.inf), axis=1, keepdims=True)
+    offsets = low + (high - low) * (jnp.arange(BINS, dtype=height.dtype) + 0.5) / BINS
+    rate = 1 / (variance * (4 * PATCH_DELTA) ** 2)
+    near = lambda offset: (weight / (1 + ((height - offset[:, None]) ** 2 + through) * rate)).sum(1)
+    held = lax.map(near, offsets.T).T
+    padded = jnp.pad(held, ((0, 0), (1, 1)), constant_values=-1)
+    peak = (held >= padded[:, :-2]) & (held > padded[:, 2:])
+    return jnp.take_along_axis(offsets, lax.top_k(jnp.where(peak, held, -1), OFFSETS)[1], axis=1)
 
 
-def _patches(view: View) -> tuple[Array, Array, Array, Array, Array]:
-    """Mean, scatter, weight, ray and floor of each patch."""
+def _patches(view: View) -> tuple[_Patches, Array]:
+    """The patches, and the middle of all that their means are about (3,)."""
     total = partial(jax.ops.segment_sum, segment_ids=view.patch, num_segments=GRID**2)
     weight = total(view.weights)
     share = (view.weights / jnp.maximum(weight, 1e-9)[view.patch])[:, None]
     first = total(share * jnp.concatenate([view.points, view.ray, view.floor[:, None]], axis=1))
     centred = view.points - first[view.patch, :3]
-    i, j = np.triu_indices(3)
-    second = total(share * centred[:, i] * centred[:, j])
-    scatter = second[:, jnp.asarray([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
+    second = total(share * centred[:, PAIRS[0]] * centred[:, PAIRS[1]])
     # An empty patch has weight 0 and needs a finite deviation.
     floor = jnp.where(weight > 0, first[:, 6], 1)
-    return first[:, :3], scatter, weight / weight.max(), first[:, 3:6], floor
+    middle = weight @ first[:, :3] / jnp.maximum(weight.sum(), 1e-9)
+    mean = jnp.where(weight[:, None] > 0, first[:, :3] - middle, 0)
+    return _Patches(mean, second, weight / weight.max(), first[:, 3:6], floor), middle
 
 
-def _within(u: Float[Array, " P"]) -> Float[Array, " P"]:
-    """How far each place of the view is inside the outline of the members: 1 in the middle, small from four deviations on."""
-    side = (jnp.arange(GRID) + 0.5) / GRID
-    place = jnp.stack(jnp.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2).astype(u.dtype)
-    share = u / jnp.maximum(u.sum(), 1e-9)
-    centred = place - share @ place
-    moments = (centred * share[:, None]).T @ centred + jnp.eye(2, dtype=u.dtype) / (12 * GRID**2)
-    return jnp.exp(-jnp.einsum("pi,ij,pj->p", centred, jnp.linalg.inv(moments), centred) / 8)
+def _within(u: Float[Array, "S P"]) -> Float[Array, "S P"]:
+    """How far each place of the view is inside the outline of members: 1 in the middle, small from four deviations on."""
+    side = (np.arange(GRID) + 0.5) / GRID
+    x, y = (c.ravel().astype(u.dtype) for c in np.meshgrid(side, side, indexing="ij"))
+    terms = jnp.asarray(np.stack([x, y, x * x, x * y, y * y], axis=1))
+    share = u / jnp.maximum(u.sum(axis=1, keepdims=True), 1e-9)
+    mx, my, xx, xy, yy = (share @ terms).T[:, :, None]
+    least = 1 / (12 * GRID**2)
+    xx, xy, yy = xx - mx * mx + least, xy - mx * my, yy - my * my + least
+    dx, dy = x - mx, y - my
+    return jnp.exp((2 * xy * dx * dy - yy * dx**2 - xx * dy**2) / (8 * (xx * yy - xy * xy)))
 
 
 def _weighted_median(values: Array, weights: Array) -> Array:
-    order = jnp.argsort(values)
-    passed = jnp.cumsum(weights[order])
-    return values[order[jnp.searchsorted(passed, passed[-1] / 2)]]
+    """By halving the range that holds it, to the last digit; far faster than sorting."""
+    half = weights.sum() / 2
+
+    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) / 2
+        below = jnp.where(values <= middle, weights, 0).sum() >= half
+        return jnp.where(below, low, middle), jnp.where(below, middle, high)
+
+    start = jnp.zeros((), values.dtype), jnp.where(weights > 0, values, 0).max()
+    return lax.fori_loop(0, jnp.finfo(values.dtype).nmant + 8, halve, start)[1]
 
 
 def view_of(

@@ -231,7 +231,7 @@ def test_without_a_plane_the_foreground_is_all_but_walls():
 def test_outline_is_full_inside_and_empty_far_outside():
     members = np.zeros((GRID, GRID))
     members[8:16, 8:16] = 1.0
-    inside = np.asarray(_within(members.ravel())).reshape(GRID, GRID)
+    inside = np.asarray(_within(members.ravel()[None])).reshape(GRID, GRID)
     assert inside[11, 11] > 0.98
     assert inside[0, 0] < 0.05
 
