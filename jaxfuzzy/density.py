@@ -34,7 +34,10 @@ PEAK_SIGMAS = 6.0
 # An outlier's support is below this share of its object's mean, and not so many deviations above the background; a point
 # counts in its own support, so that above no background one alone is an outlier and one with a neighbour is none.
 SPARSE, SPARSE_SIGMAS = 0.2, 2.2
-BLOCK = 64
+# Places and queries that meet at a time.
+BLOCK, QUERIES = 512, 64
+# Processors that have wide vectors need three quarters of the time with them; the compiler takes halves by default.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 @record
@@ -78,44 +81,45 @@ def part(
         bandwidth: Bandwidth h of the support.
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
     """
-    held, background = _survey(places, weights, box, bandwidth)
-    for most in PROTOTYPES:
-        tiling = _tile(places, weights, held, background, bandwidth, most=most)
-        if not np.asarray(tiling.real)[-1]:
-            return _divide(places, weights, box, bandwidth, tiling, allowed)
-    return None
+    survey = _survey(places, weights, box, bandwidth)
+    real = int(survey.real.sum())
+    # One seed more than there are places for would say that the tiling is not whole.
+    most = next((c for c in PROTOTYPES if real < c), None)
+    return None if most is None else _divide(places, weights, box, bandwidth, survey, allowed, most=most)
 
 
 @record
-class Tiling:
-    """Small clusters that tile the dense parts of a plane.
+class Survey:
+    """The density of a plane, and where small clusters that tile its dense parts are to start.
 
     Attributes:
-        prototypes: Their centers, the strongest seed's first.
-        real: Which of them are.
         held: Support of each place.
-        objective: Objective of the noise clustering.
+        background: Support where there is nothing but outliers.
+        seeds: Starts of the small clusters, the strongest first.
+        real: Which of them are.
     """
 
-    prototypes: Float[Array, "C 2"]
-    real: Bool[Array, " C"]
     held: Float[Array, " P"]
-    objective: Float[Array, ""]
+    background: Float[Array, ""]
+    seeds: Float[Array, "C 2"]
+    real: Bool[Array, " C"]
 
 
-@jax.jit
-def _survey(places: Array, weights: Array, box: Array, bandwidth: Array) -> tuple[Array, Array]:
-    """Support of each place, and the background."""
+@partial(jax.jit, compiler_options=WIDE)
+def _survey(places: Array, weights: Array, box: Array, bandwidth: Array) -> Survey:
     queries = jnp.concatenate([places, _lattice(box, bandwidth)])
-    held, around = jnp.split(_supports(queries, places, weights, bandwidth[None])[0], [len(places)])
-    return held, jnp.median(around)
-
-
-@partial(jax.jit, static_argnames="most")
-def _tile(places: Array, weights: Array, held: Array, background: Array, bandwidth: Array, *, most: int) -> Tiling:
-    """Noise clustering from mountain seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2)."""
+    # Points of weight 0 are asked for too.
+    wanted = jnp.ones(len(queries), bool)
+    held, around = jnp.split(_supports(queries, wanted, places, weights, bandwidth[None])[0], [len(places)])
+    background = jnp.median(around)
     least = (jnp.sqrt(background) + SEED_SIGMAS / 2) ** 2
-    seeds, real = _mountains(places, held, weights, bandwidth, least, most)
+    return Survey(held, background, *_mountains(places, held, weights, bandwidth, least, PROTOTYPES[-1]))
+
+
+def _tile(
+    places: Array, weights: Array, bandwidth: Array, seeds: Array, real: Array
+) -> tuple[Float[Array, "C 2"], Float[Array, ""]]:
+    """Noise clustering from seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2). The clusters and their objective."""
     delta = DELTA * bandwidth
 
     def update(prototypes: Array, _: None) -> tuple[Array, Array]:
@@ -127,14 +131,17 @@ def _tile(places: Array, weights: Array, held: Array, background: Array, bandwid
         return jnp.where(real[:, None] & (mass > 0), moved, prototypes), weights @ (1 / total[:, 0])
 
     prototypes, objectives = lax.scan(update, seeds, length=SWEEPS)
-    return Tiling(prototypes, real, held, objectives[-1])
+    return prototypes, objectives[-1]
 
 
-@jax.jit
-def _divide(places: Array, weights: Array, box: Array, bandwidth: Array, tiling: Tiling, allowed: Array) -> Groups:
-    prototypes, real, most = tiling.prototypes, tiling.real, len(allowed)
+@partial(jax.jit, static_argnames="most", compiler_options=WIDE)
+def _divide(
+    places: Array, weights: Array, box: Array, bandwidth: Array, survey: Survey, allowed: Array, *, most: int
+) -> Groups:
+    real = survey.real[:most]
+    prototypes, objective = _tile(places, weights, bandwidth, survey.seeds[:most], real)
     one, other, near = _neighbours(prototypes, real, bandwidth)
-    peaks, saddles, backgrounds = _landscape(prototypes, one, other, places, weights, box, bandwidth)
+    peaks, saddles, backgrounds = _landscape(prototypes, real, one, other, near, places, weights, box, bandwidth)
     peaks = jnp.where(real, peaks, 0)
     saddles = jnp.where(near, jnp.minimum(saddles, jnp.minimum(peaks[:, one], peaks[:, other])), -1)
     orders = jnp.argsort(-saddles, axis=1, stable=True)
@@ -145,7 +152,7 @@ def _divide(places: Array, weights: Array, box: Array, bandwidth: Array, tiling:
     peak, order, valley, prominence = peaks[level], orders[level], valleys[level], prominences[level]
 
     # The nearest number that is allowed, the lower of two.
-    numbers = jnp.arange(1, most + 1)
+    numbers = jnp.arange(1, len(allowed) + 1)
     wanted = numbers[jnp.argmin(jnp.where(allowed, jnp.abs(numbers - counts[level]), jnp.inf))]
     kept = (_rank(-prominence) < wanted) & real
     root = _join(one[order], other[order], near[order], peak, kept | (valley >= 1))
@@ -154,13 +161,13 @@ def _divide(places: Array, weights: Array, box: Array, bandwidth: Array, tiling:
 
     inverse = jnp.where(real, 1 / _squared_distances(places, prototypes, bandwidth), 0)
     inverse = inverse / inverse.sum(axis=1, keepdims=True)
-    shares = inverse @ (group[:, None] == jnp.arange(most)).astype(places.dtype)
+    shares = inverse @ (group[:, None] == jnp.arange(len(allowed))).astype(places.dtype)
     mine = weights[:, None] * shares**2
-    usual = (tiling.held @ mine) / jnp.maximum(mine.sum(axis=0), jnp.finfo(places.dtype).tiny)
+    usual = (survey.held @ mine) / jnp.maximum(mine.sum(axis=0), jnp.finfo(places.dtype).tiny)
     chance = (jnp.sqrt(backgrounds[BASE]) + SPARSE_SIGMAS / 2) ** 2
     least = jnp.minimum(SPARSE * usual[jnp.argmax(shares, axis=1)], chance)
-    typicality = tiling.held / jnp.maximum(least, jnp.finfo(places.dtype).tiny)
-    return Groups(prototypes, group, counts, counts[level], kept.sum(), shares, typicality, tiling.objective)
+    typicality = survey.held / jnp.maximum(least, jnp.finfo(places.dtype).tiny)
+    return Groups(prototypes, group, counts, counts[level], kept.sum(), shares, typicality, objective)
 
 
 def _rank(values: Array) -> Array:
@@ -192,31 +199,44 @@ def _steadiest(counts: Int[Array, " L"]) -> Int[Array, ""]:
 
 def _supports(
     queries: Float[Array, "M 2"],
+    wanted: Bool[Array, " M"],
     places: Float[Array, "P 2"],
     weights: Float[Array, " P"],
     bandwidths: Float[Array, " L"],
 ) -> Float[Array, "L M"]:
-    """Support of each query at each bandwidth, summed over blocks of places.
+    """Support of each query that is wanted at each bandwidth, 0 of the others; summed over blocks of places.
 
     The bandwidths are one ladder of a factor 2 in h² downwards from each of the last two, which takes two exponentials for all.
     """
     levels = len(bandwidths)
+    # What counts comes first, so that blocks of padding need not be looked at.
+    turn, order = jnp.argsort(~wanted), jnp.argsort(weights == 0)
+    rows = _blocks(queries[turn], QUERIES)
+    place, weight = _blocks(places[order], BLOCK), _blocks(weights[order], BLOCK, fill=True)
 
-    def add(total: Array, block: tuple[Array, Array]) -> tuple[Array, None]:
-        place, weight = block
-        square = (queries**2).sum(axis=1)[:, None] + (place**2).sum(axis=1) - 2 * queries @ place.T
-        square = -0.5 * jnp.maximum(square, 0)
-        rows: dict[int, Array] = {}
-        kernels: dict[int, Array] = {}
-        for level in reversed(range(levels)):
-            above = kernels.get(level + 2)
-            kernels[level] = jnp.exp(square / bandwidths[level] ** 2) if above is None else above**2
-            rows[level] = kernels[level] @ weight
-        return total + jnp.stack([rows[level] for level in range(levels)]), None
+    def of_block(row: int, found: Array) -> Array:
+        def add(i: int, total: Array) -> Array:
+            dx, dy = (rows[row, :, None, axis] - place[i, :, axis] for axis in (0, 1))
+            square = -0.5 * (dx**2 + dy**2)
+            kernels: dict[int, Array] = {}
+            for level in reversed(range(levels)):
+                above = kernels.get(level + 2)
+                kernels[level] = jnp.exp(square / bandwidths[level] ** 2) if above is None else above**2
+            return total + jnp.stack([kernels[level] @ weight[i] for level in range(levels)])
 
-    block = min(BLOCK, len(places))
-    blocks = places.reshape(-1, block, 2), weights.reshape(-1, block)
-    return lax.scan(add, jnp.zeros((levels, len(queries)), places.dtype), blocks)[0]
+        stop = -(-(weights > 0).sum() // BLOCK)
+        return found.at[row].set(lax.fori_loop(0, stop, add, jnp.zeros_like(found[0])))
+
+    found = jnp.zeros((len(rows), levels, QUERIES), places.dtype)
+    found = lax.fori_loop(0, -(-wanted.sum() // QUERIES), of_block, found)
+    found = jnp.moveaxis(found, 0, 1).reshape(levels, -1)[:, : len(queries)]
+    return jnp.where(wanted, jnp.zeros_like(found).at[:, turn].set(found), 0)
+
+
+def _blocks(values: Array, size: int, fill: bool = False) -> Array:
+    """Rows in blocks of one size, the last one filled by zeros or, where these would lie elsewhere, by its own last row."""
+    pad = ((0, -len(values) % size), *((0, 0),) * (values.ndim - 1))
+    return jnp.pad(values, pad, mode="constant" if fill else "edge").reshape(-1, size, *values.shape[1:])
 
 
 def _mountains(
@@ -252,14 +272,23 @@ def _neighbours(prototypes: Array, real: Array, bandwidth: Array) -> tuple[Array
 
 
 def _landscape(
-    prototypes: Array, one: Array, other: Array, places: Array, weights: Array, box: Array, bandwidth: Array
+    prototypes: Array,
+    real: Array,
+    one: Array,
+    other: Array,
+    near: Array,
+    places: Array,
+    weights: Array,
+    box: Array,
+    bandwidth: Array,
 ) -> tuple[Array, Array, Array]:
     """At each bandwidth of the ladder: support at the prototypes, the least on the way between neighbours, the background."""
     stops = ((jnp.arange(STOPS) + 1) / (STOPS + 1)).astype(places.dtype)[:, None]
     way = prototypes[one][:, None] * (1 - stops) + prototypes[other][:, None] * stops
     lattice = _lattice(box, bandwidth)
     queries = jnp.concatenate([prototypes, way.reshape(-1, 2), lattice])
-    held = _supports(queries, places, weights, bandwidth * jnp.asarray(LADDER, places.dtype))
+    wanted = jnp.concatenate([real, jnp.repeat(near, STOPS), jnp.ones(len(lattice), bool)])
+    held = _supports(queries, wanted, places, weights, bandwidth * jnp.asarray(LADDER, places.dtype))
     peaks, on_way, around = jnp.split(held, [len(prototypes), len(queries) - len(lattice)], axis=1)
     return peaks, on_way.reshape(len(LADDER), -1, STOPS).min(axis=-1), jnp.median(around, axis=1)
 

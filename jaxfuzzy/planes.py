@@ -31,7 +31,7 @@ PATCH_DELTA, POINT_DELTA = 1.0, 2.5
 SIDEWAYS = 0.1
 # Coordinates of the products that make a scatter, how often each stands in it, and how often cofactors are squared.
 PAIRS, TWICE = np.triu_indices(3), np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0], np.float32)
-SQUARINGS = 5
+SQUARINGS = 9
 
 
 @record

@@ -33,17 +33,21 @@ def blobs(centers, counts=200, spread=0.02, seed=0):
 
 def test_support_is_a_sum_of_gaussians():
     rng = np.random.default_rng(0)
-    places, queries, weights = rng.normal(size=(128, 2)), rng.normal(size=(7, 2)), rng.uniform(0, 2, 128)
+    # More than a block of either, some places without weight, some queries that nobody asked for.
+    places, queries, weights = rng.normal(size=(600, 2)), rng.normal(size=(70, 2)), rng.uniform(0, 2, 600)
+    weights[::3], wanted = 0, np.arange(70) % 5 != 2
     bandwidths = 0.3 * density.LADDER
     expected = [
         [
             sum(w * np.exp(-((q - p) ** 2).sum() / (2 * h**2)) for p, w in zip(places, weights, strict=True))
-            for q in queries
+            if asked
+            else 0
+            for q, asked in zip(queries, wanted, strict=True)
         ]
         for h in bandwidths
     ]
-    got = density._supports(*map(jnp.asarray, (queries, places, weights, bandwidths)))
-    # |q - p|² = |q|² - 2 qp + |p|² loses some 1e-15, divided by h² of 0.04; the squared kernels double it.
+    got = density._supports(*map(jnp.asarray, (queries, wanted, places, weights, bandwidths)))
+    # Exponents of up to a few hundred are rounded by some 1e-14 of their own, which squared kernels double.
     np.testing.assert_allclose(got, expected, rtol=1e-11)
 
 
@@ -52,16 +56,15 @@ def test_tiling_is_noise_clustering():
     points, _ = blobs([(0, 0), (0.3, 0.1)])
     places, weights = points[:256, [0, 2]], np.linspace(0.5, 1.5, 256)
     h = 0.02
-    held, background = density._survey(*map(jnp.asarray, (places, weights, np.array([[-0.1, -0.1], [0.4, 0.2]]), h)))
-    tiling = density._tile(*map(jnp.asarray, (places, weights, held, background, h)), most=64)
-    real = np.asarray(tiling.real)
+    survey = density._survey(*map(jnp.asarray, (places, weights, np.array([[-0.1, -0.1], [0.4, 0.2]]), h)))
+    real = np.asarray(survey.real)
     assert 3 < real.sum() < 64
-    least = (jnp.sqrt(background) + density.SEED_SIGMAS / 2) ** 2
-    seeds, _ = density._mountains(*map(jnp.asarray, (places, held, weights, h, least)), 64)
+    prototypes, _ = density._tile(jnp.asarray(places), jnp.asarray(weights), jnp.asarray(h), survey.seeds, survey.real)
+    seeds = survey.seeds
     solver = Solver(max_steps=density.SWEEPS, tol=0.0, acceleration=None)
     fit = fcm(places, seeds[real], noise_distance=density.DELTA * h, weights=weights, solver=solver)
     # The tiling bounds distances from below by a thousandth of the noise distance, 5e-5 here.
-    np.testing.assert_allclose(tiling.prototypes[real], fit.centers, atol=1e-7)
+    np.testing.assert_allclose(prototypes[real], fit.centers, atol=1e-7)
 
 
 def test_seeds_are_mountains_apart():
