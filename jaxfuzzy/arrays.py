@@ -21,6 +21,8 @@ ArrayLike = JaxArrayLike | Sequence[Any]
 Scalar = float | Float[Array, ""]
 
 T = TypeVar("T")
+# Compiler's options: processors that have wide vectors are up to a quarter faster with them; it takes halves by default.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 def static(**kwargs: Any) -> Any:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfuzzy.arrays import Array, Bool, Float, Int, record
+from jaxfuzzy.arrays import WIDE, Array, Bool, Float, Int, record
 
 # Small clusters that tile the objects (the sizes compiled); neighbours each is compared with, at so many places on the way.
 PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
@@ -36,8 +36,6 @@ PEAK_SIGMAS = 6.0
 SPARSE, SPARSE_SIGMAS = 0.2, 2.2
 # Places and queries that meet at a time.
 BLOCK, QUERIES = 512, 64
-# Processors that have wide vectors need three quarters of the time with them; the compiler takes halves by default.
-WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 @record

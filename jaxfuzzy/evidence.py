@@ -12,13 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.choice import PLANE_BONUS
+from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.search import KINDS, MORE
 from jaxfuzzy.shapes import FAMILIES, Shape, refused
 from jaxfuzzy.status import Status
 
-# Neighboring pixels that together tell as much of a size as one independent point: 84 to 335, 190 on average, against the
-# ground truth of thirteen real pairs (`measure_noise`).
-PIXELS_PER_POINT = 190
 # Pixels of as many independent points as the largest number of parameters of a kind.
 FEWEST_PIXELS = 6 * PIXELS_PER_POINT
 # In nats of independent points: below, another family is as likely, and the next kind is nearly as good.

@@ -1,4 +1,4 @@
-"""The compiled part of shape fitting: a padded batch of objects in, the best surface of each out; and bounded primitives."""
+"""The compiled part of shape fitting: a padded object in, its best surface out; and bounded primitives."""
 
 from functools import partial
 from typing import NamedTuple
@@ -6,10 +6,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jaxfuzzy import bounds, polish, rays, search
-from jaxfuzzy.arrays import Array
+from jaxfuzzy.arrays import WIDE, Array
+from jaxfuzzy.candidates import Candidates
 from jaxfuzzy.objects import MOST, Frame, Prepared
 from jaxfuzzy.primitives import Primitive
 
@@ -20,77 +20,117 @@ SCALES = (0.2, 8.0)
 TOLERANCES = {jnp.dtype(jnp.float32): 1e-5, jnp.dtype(jnp.float64): 1e-9}
 
 
+class Start(NamedTuple):
+    """What a polish starts from: a candidate, the rotation into its frame, its noise scale and its share of background."""
+
+    candidate: Candidates
+    turn: Array
+    scale: Array
+    background: Array
+
+
 class Fitted(NamedTuple):
-    """The best surface of each object.
+    """The surface of an object, and what the search found of all kinds.
 
     Attributes:
         kind: Index of its kind.
         scores: Score of every kind (5,).
         passed: Whether it is allowed and no guard speaks against it (5,).
-        detail: Signs of a box, ends of a body of revolution (3,).
-        deviation: Factor found for deviations that were not given, else 1.
-        local: What small windows say of the points' deviation, in units of that used.
-        normals: Normals of small pieces of surface, in the object's frame (W, 3), 0 where unusable.
+        found: The best candidate of each kind.
         polished: The surface on all points.
     """
 
-    kind: Array
-    scores: Array
-    passed: Array
-    detail: Array
-    deviation: Array
-    local: Array
-    normals: Array
+    kind: int
+    scores: np.ndarray
+    passed: np.ndarray
+    found: search.Found
     polished: polish.Polished
 
+    @property
+    def detail(self) -> np.ndarray:
+        """Signs of a box, ends of a body of revolution (3,)."""
+        return np.asarray(self.found.candidates.detail[self.kind])
 
-# Processors that have wide vectors are a tenth faster with them; the compiler takes halves by default.
-@partial(jax.jit, static_argnames="along_ray", compiler_options={"xla_cpu_prefer_vector_width": 512})
-def fit_batch(batch: dict[str, Array], allowed: Array, gric: Array, along_ray: bool) -> Fitted:
-    """Fits all objects of a padded batch, one after the other; padding costs nothing.
+    @property
+    def deviation(self) -> float:
+        """Factor found for deviations that were not given, else 1."""
+        return float(self.found.deviation)
+
+    @property
+    def local(self) -> float:
+        """What small windows say of the points' deviation, in units of that used."""
+        return float(self.found.local)
+
+
+def fit(item: dict[str, np.ndarray], allowed: np.ndarray, gric: bool, along_ray: bool) -> Fitted:
+    """The best surface of one object.
 
     Args:
-        batch: As `objects.stacked` makes it.
+        item: As `objects.padded` makes it.
         allowed: Which kinds may be chosen (5,).
         gric: Whether to score by GRIC in place of the likelihood.
         along_ray: Whether residuals are along the viewing ray.
     """
+    found = jax.device_get(_search(item, np.asarray(gric), along_ray))
+    passed = found.passed & allowed
+    kind = int(np.argmin(np.where(passed, found.scores, np.inf)))
+    return Fitted(kind, found.scores, passed, found, finished(item, found, kind, along_ray))
 
-    @jax.jit
-    def one(item: dict[str, Array]) -> Fitted:
-        view = _view(item, along_ray)
-        dtype = view.gain.dtype
-        # Searching in single precision is enough for any dtype: the winner is polished in the input's own.
-        small = jax.tree.map(lambda a: a.astype(jnp.float32), view)
-        found = search.search(small, item["depth_range"].astype(jnp.float32), allowed, item["given"], gric)
-        take = lambda a: a[found.kind].astype(dtype)
-        polished = polish.polish(
-            jnp.asarray(FAMILIES)[found.kind],
-            jax.tree.map(take, found.candidates),
-            take(found.turn),
-            view._replace(gain=view.gain / found.deviation.astype(dtype)),
-            take(found.scale),
-            take(found.background),
-            item["depth_range"],
-            item["lean"],
-            SCALES,
-            TOLERANCES[dtype],
-        )
-        return Fitted(
-            found.kind,
-            found.scores,
-            found.passed,
-            take(found.candidates.detail),
-            found.deviation.astype(dtype),
-            found.local,
-            found.normals,
-            polished,
-        )
 
-    def empty(item: dict[str, Array]) -> Fitted:
-        return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(one, item))
+def finished(item: dict[str, np.ndarray], found: search.Found, kind: int, along_ray: bool) -> polish.Polished:
+    """The best candidate of a kind, polished on all points."""
+    start = jax.tree.map(lambda a: a[kind], Start(found.candidates, found.turn, found.scale, found.background))
+    return polished_from(item, start, kind, float(found.deviation), along_ray)
 
-    return lax.map(lambda item: lax.cond(item["weight"].sum() > 0, one, empty, item), batch)
+
+def polished_from(
+    item: dict[str, np.ndarray], start: Start, kind: int, deviation: float, along_ray: bool
+) -> polish.Polished:
+    """A surface of a kind, polished on all points."""
+    # The search is in single precision: a rotation is made one to the last digit of double.
+    turn = np.asarray(start.turn, float)
+    turn = 1.5 * turn - 0.5 * turn @ turn.T @ turn
+    dtype, family = item["gain"].dtype, np.asarray(FAMILIES[kind], np.int32)
+    start = jax.tree.map(lambda a: np.asarray(a, dtype), start._replace(turn=turn))
+    return jax.device_get(_polish(item, family, start, np.asarray(deviation, dtype), along_ray))
+
+
+@partial(jax.jit, static_argnames="along_ray", compiler_options=WIDE)
+def _search(item: dict[str, Array], gric: Array, along_ray: bool) -> search.Found:
+    """The best candidate of each kind for one object; single precision is enough, as the winner is polished in the input's own."""
+    small = jax.tree.map(lambda a: a.astype(jnp.float32), _view(item, along_ray))
+    return search.search(small, item["depth_range"].astype(jnp.float32), item["given"], gric)
+
+
+@partial(jax.jit, static_argnames="along_ray", compiler_options=WIDE)
+def _polish(item: dict[str, Array], family: Array, start: Start, deviation: Array, along_ray: bool) -> polish.Polished:
+    view = _view(item, along_ray)
+    return polish.polish(
+        family,
+        start.candidate,
+        start.turn,
+        view._replace(gain=view.gain / deviation),
+        start.scale,
+        start.background,
+        item["depth_range"],
+        item["lean"],
+        SCALES,
+        TOLERANCES[view.gain.dtype],
+    )
+
+
+def _ahead_of_search(item: dict[str, np.ndarray], along_ray: bool) -> None:
+    _search(item, np.asarray(False), along_ray)
+
+
+def _ahead_of_polish(item: dict[str, np.ndarray], along_ray: bool) -> None:
+    none = np.zeros(())
+    start = Start(Candidates(np.zeros(5), np.zeros(3), np.zeros(7)), np.eye(3), none + 1, none + 0.5)  # type: ignore[arg-type]
+    polished_from(item, start, 0, 1.0, along_ray)
+
+
+# Compiled one beside the other, given an object without points.
+PARTS = (_ahead_of_search, _ahead_of_polish)
 
 
 def _view(item: dict[str, Array], along_ray: bool) -> rays.View:

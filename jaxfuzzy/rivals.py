@@ -12,13 +12,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxfuzzy.evidence import PIXELS_PER_POINT, TELLS, margin_of, spoken_against
+from jaxfuzzy.evidence import TELLS, margin_of, spoken_against
+from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.outline import Sight, seen_through
 from jaxfuzzy.search import KINDS
 from jaxfuzzy.shapes import Shape
 
-# Fits the shapes in some places of the list anew, as one kind.
-Again = Callable[[Sequence[int], str], tuple[Shape, ...]]
+# The shapes in some places of the list as other kinds, one each.
+Again = Callable[[Sequence[int], Sequence[str]], tuple[Shape, ...]]
 
 # A surface leaves this share of its points to the background at least.
 LEAST_OUTLIERS = 0.01
@@ -34,19 +35,19 @@ def chosen_by_outline(
         members: Indices of the points of each shape.
         shapes: The shapes, their scores in nats of independent points.
         sight: What the camera sees.
-        again: Fits some of them anew as one kind, with scores like these.
+        again: Some of them as other kinds, with scores like these.
     """
     shapes = [_with_cost(points, own, shape, sight) for own, shape in zip(members, shapes, strict=True)]
     tried = [{shape.kind} for shape in shapes]
     for _ in KINDS:
-        rivals = {kind: [i for i, shape in enumerate(shapes) if kind == _rival(shape, tried[i])] for kind in KINDS}
-        if not any(rivals.values()):
+        named = ((i, _rival(shape, tried[i])) for i, shape in enumerate(shapes))
+        rivals = {i: kind for i, kind in named if kind is not None}
+        if not rivals:
             break
-        for kind, of in rivals.items():
-            for i, rival in zip(of, again(of, kind) if of else (), strict=True):
-                tried[i].add(kind)
-                if rival.primitive is not None:
-                    shapes[i] = _better(shapes[i], _with_cost(points, members[i], rival, sight))
+        for i, rival in zip(rivals, again(list(rivals), list(rivals.values())), strict=True):
+            tried[i].add(rivals[i])
+            if rival.primitive is not None:
+                shapes[i] = _better(shapes[i], _with_cost(points, members[i], rival, sight))
     return tuple(shapes)
 
 

@@ -29,7 +29,7 @@ from jaxfuzzy.primitives import Plane
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.rivals import chosen_by_outline
 from jaxfuzzy.segment import Segmentation, segment
-from jaxfuzzy.shapes import Shape, fit_members, with_quadrics
+from jaxfuzzy.shapes import Fits, Shape, with_quadrics
 from jaxfuzzy.stereo import reconstruct
 from jaxfuzzy.vertical import agreed_vertical, upright_again, witness_of
 
@@ -250,11 +250,13 @@ def _model(
             loose[own[np.concatenate([np.zeros(0, int), *members])]] = False
             sight = sight_of(points, loose, eye, np.asarray(vertical, float))
 
-        def fitted(sets: Sequence[np.ndarray], **only: Any) -> tuple[Shape, ...]:
-            return fit_members(places, sets, **seen(own) | picked | {"rule": shape_rule, "capacity": OF_SCENE} | only)
+        fits = Fits(places, **seen(own) | picked | {"rule": shape_rule, "capacity": OF_SCENE})
+        correlated = cloud.pixels_px is not None and shape_rule != "paper"
 
-        def fit(sets: Sequence[np.ndarray], wholes: Sequence[np.ndarray] | None = None) -> tuple[Shape, ...]:
-            found = fitted(sets)
+        def fit(
+            sets: Sequence[np.ndarray], wholes: Sequence[np.ndarray] | None = None, further: bool = True
+        ) -> tuple[Shape, ...]:
+            found = fits.shapes(sets, further=further)
             if sight is None:
                 return found
             of = None if wholes is None else [own[m] for m in wholes]
@@ -263,16 +265,16 @@ def _model(
         def parted(of: np.ndarray) -> np.ndarray:
             return np.asarray(segment(places[of], **seen(own[of])).labels)
 
-        def as_kind(of: Sequence[int], kind: str) -> tuple[Shape, ...]:
-            return in_independent_points(fitted([members[i] for i in of], kinds=(kind,)), OF_SCENE)
+        def as_kinds(of: Sequence[int], kinds: Sequence[str]) -> tuple[Shape, ...]:
+            return in_independent_points(fits.shapes_as([members[i] for i in of], kinds), OF_SCENE)
 
-        def stood(of: Sequence[int], kind: str, lean: float) -> tuple[Shape, ...]:
+        def stood(of: Sequence[int], lean: float) -> tuple[Shape, ...]:
             # The prior is weighed against all points that a fit counts, of which few are independent.
             leans = [lean / np.sqrt(worth(len(members[i]), OF_SCENE) if correlated else 1.0) for i in of]
-            found = fitted([members[i] for i in of], kinds=(kind,), leans=leans)
+            sets, kinds = [members[i] for i in of], [shapes[i].kind for i in of]
+            found = fits.shapes_about(sets, kinds, np.asarray(vertical, float), leans)
             return in_independent_points(found, OF_SCENE) if correlated else found
 
-        correlated = cloud.pixels_px is not None and shape_rule != "paper"
         least = FEWEST_PIXELS if correlated else FEWEST
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
@@ -284,7 +286,7 @@ def _model(
         if sight is not None:
             mine = [own[m] for m in members]
             if correlated:
-                shapes = chosen_by_outline(points, mine, shapes, sight, as_kind)
+                shapes = chosen_by_outline(points, mine, shapes, sight, as_kinds)
             shapes = without_seen_through(points, mine, shapes, sight)
             if correlated:
                 depth = lengths(points - eye)

@@ -31,12 +31,11 @@ LEAST_DEVIATION = 2e-5
 
 
 class Found(NamedTuple):
-    """The best candidate of each kind, in the order of `KINDS`, and which kind is best.
+    """The best candidate of each kind, in the order of `KINDS`.
 
     Attributes:
-        kind: Index of the best kind.
         scores: Score of each kind, lower is better (5,).
-        passed: Whether it is allowed and no guard speaks against its best candidate (5,).
+        passed: Whether no guard speaks against its best candidate (5,).
         candidates: The best candidate of each kind.
         turn: Rotation into the frame of each, in which its axis is y (5, 3, 3).
         scale: Noise scale of each.
@@ -46,7 +45,6 @@ class Found(NamedTuple):
         normals: Normals of small pieces of surface (W, 3), 0 where unusable.
     """
 
-    kind: Array
     scores: Array
     passed: Array
     candidates: Candidates
@@ -58,13 +56,12 @@ class Found(NamedTuple):
     normals: Array
 
 
-def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: Array) -> Found:
-    """Finds the best surface of each kind and chooses among the allowed ones (5,).
+def search(view: View, depth_range: Array, given: Array, gric: Array) -> Found:
+    """Finds the best surface of each kind.
 
     Args:
         view: All points; where `given` is false, gains are right but for a common factor, which is found here.
         depth_range: Range of depth over which background is spread.
-        allowed: Which kinds may be chosen (5,).
         given: Whether the deviation of the points is known.
         gric: Whether to score by GRIC in place of the likelihood.
     """
@@ -91,7 +88,7 @@ def search(view: View, depth_range: Array, allowed: Array, given: Array, gric: A
     upright = jnp.broadcast_to(turn, (len(fine.theta), 3, 3))
     fine, turns, _, seen = descend(fine, counts, upright, more, FINE, 0.2, view.ray is not None)
     assert turns is not None
-    return _choose(fine, turns, counts, seen, more, depth_range, allowed, gric)._replace(
+    return _choose(fine, turns, counts, seen, more, depth_range, gric)._replace(
         deviation=deviation,
         local=typical / deviation,
         normals=jnp.where(patches.usable[:, None], patches.normal, 0.0),
@@ -105,7 +102,6 @@ def _choose(
     seen: Seen,
     more: View,
     depth_range: Array,
-    allowed: Array,
     gric: Array,
 ) -> Found:
     mixed = choice.mixture(seen.square, seen.variance, more, depth_range, SCALES)
@@ -141,11 +137,9 @@ def _choose(
     own = kind == jnp.arange(5)[:, None]
     # The best that passes, or where none does the best of those.
     best = jnp.argmin(jnp.where(own, score + jnp.where(good, 0.0, 1e12), jnp.inf), -1)
-    passed, scores = good[best] & allowed, score[best]
     return Found(
-        kind=jnp.argmin(jnp.where(passed, scores, jnp.inf)),
-        scores=scores,
-        passed=passed,
+        scores=score[best],
+        passed=good[best],
         candidates=fine.take(best),
         turn=turns[best],
         scale=mixed.scale[best],

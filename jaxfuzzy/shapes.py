@@ -5,6 +5,7 @@ known: stereo errs along the ray alone, so a surface should predict one depth a 
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -12,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy import bounds, checks
+from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
-from jaxfuzzy.fitting import TOLERANCES, Fitted, Judged, assemble_batch, judged
-from jaxfuzzy.looks import Look, Settings, look_at, side_by_side, unfit
+from jaxfuzzy.assembly import Bounded, bounded
+from jaxfuzzy.fitting import TOLERANCES, Fitted
+from jaxfuzzy.looks import Look, Settings, first_looks, further_looks, look_about, look_as, side_by_side, unfit
 from jaxfuzzy.mostpoints import most_points
-from jaxfuzzy.objects import BATCH, DEVIATIONS, MOST, Frame, batches, capacity_for, prepared
+from jaxfuzzy.objects import DEVIATIONS, MOST, Prepared, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
 from jaxfuzzy.quadrics import quadric_of
 from jaxfuzzy.search import KINDS
@@ -152,9 +154,8 @@ def fit_shapes(
     array = checks.places(points)
     label = checks.labels(labels, len(array))
     members = [np.flatnonzero(label == k) for k in range(int(label.max()) + 1)]
-    shapes = fit_members(
+    fits = Fits(
         array,
-        members,
         noise_distance=noise_distance,
         kinds=kinds,
         up=up,
@@ -163,28 +164,15 @@ def fit_shapes(
         rule=rule,
         weights=weights,
     )
+    shapes = fits.shapes(members)
     return with_quadrics(np.asarray(array), members, shapes, weights)
 
 
-def fit_members(
-    points: Float[ArrayLike, "N 3"],
-    members: Sequence[np.ndarray],
-    *,
-    noise_distance: Literal["auto"] | ArrayLike = "auto",
-    kinds: Sequence[str] = KINDS,
-    up: ArrayLike = (0.0, 1.0, 0.0),
-    camera: ArrayLike | None = None,
-    distance: Literal["ray", "geometric", "algebraic"] | None = None,
-    rule: Literal["likelihood", "gric", "paper"] = "likelihood",
-    weights: ArrayLike | None = None,
-    capacity: int = 0,
-    leans: Sequence[float] | None = None,
-) -> tuple[Shape, ...]:
-    """The same for sets of points that may overlap.
+class Fits:
+    """Shapes of sets of points of one cloud, which may overlap; none of them is searched twice.
 
     Args:
         points: Points (N, 3) in metres.
-        members: Indices of the points of each set.
         noise_distance: As in `fit_shape`; so are the others.
         kinds: See there.
         up: See there.
@@ -192,51 +180,121 @@ def fit_members(
         distance: See there.
         rule: See there.
         weights: See there.
-        capacity: Points that a set is fitted to at most; 0 to choose by the sets. Larger sets are fitted to a fair sample, and all
-            their points judged.
-        leans: Standard deviation in radians with which the axis of each may lean from `up`; ten degrees by default.
+        capacity: Points that a set is fitted to at most; 0 to choose by the first sets. Larger sets are fitted to a fair sample,
+            and all their points judged.
     """
-    array = checks.places(points)
-    count = len(array)
-    delta = _noise(noise_distance, count)
-    kinds = _kinds(kinds)
-    vertical = checks.direction(up, "up")
-    eye = None if camera is None else np.asarray(checks.points(np.reshape(camera, (1, -1)), "camera", dims=3), float)[0]
-    checks.choice(rule, "rule", ("likelihood", "gric", "paper"))
-    usual = "algebraic" if rule == "paper" else "geometric" if eye is None else "ray"
-    able = ("geometric", "algebraic") if rule == "paper" else ("ray", "geometric")
-    distance = checks.choice(distance or usual, f"distance with rule={rule!r}", able)
-    if distance == "ray" and eye is None:
-        raise ValueError("camera must be given with distance='ray', got None")
-    weight = checks.weights(weights, count)
-    p = np.asarray(array, float)
-    w = np.ones(count) if weight is None else np.asarray(weight, float)
-    along_ray = distance == "ray" or (rule == "paper" and eye is not None)
-    objects = [
-        prepared(p.take(m, axis=0), w[m], None if delta is None else delta[m] / DEVIATIONS, vertical, eye, along_ray)
-        if len(m)
-        else None
-        for m in members
-    ]
-    if leans is not None:
-        objects = [o and o._replace(lean=lean) for o, lean in zip(objects, leans, strict=True)]
-    poor = [unfit(o) for o in objects]
-    good = [o for o, status in zip(objects, poor, strict=True) if o is not None and not status]
-    most = max((len(o.points) for o in good), default=1)
-    settings = Settings(kinds, rule == "gric", along_ray, eye, array.dtype, capacity_for(min(capacity or most, MOST)))
-    fit = [i for i, status in enumerate(poor) if not status]
-    looks = dict(zip(fit, look_at(good, settings), strict=True))
-    if rule != "paper":
-        return _shapes(looks, poor, [len(m) for m in members], settings)
-    shapes = []
-    for i, m in enumerate(members):
-        if i in looks:
-            own = None if delta is None else delta[m]
-            shapes.append(_by_most_points(np.asarray(array)[m], w[m], own, looks[i], vertical, settings, distance))
-        else:
-            arrays, told = _unknown(len(m), None, poor[i], settings)
-            shapes.append(Shape(**jax.device_put(arrays), **told))
-    return tuple(shapes)
+
+    def __init__(
+        self,
+        points: Float[ArrayLike, "N 3"],
+        *,
+        noise_distance: Literal["auto"] | ArrayLike = "auto",
+        kinds: Sequence[str] = KINDS,
+        up: ArrayLike = (0.0, 1.0, 0.0),
+        camera: ArrayLike | None = None,
+        distance: Literal["ray", "geometric", "algebraic"] | None = None,
+        rule: Literal["likelihood", "gric", "paper"] = "likelihood",
+        weights: ArrayLike | None = None,
+        capacity: int = 0,
+    ) -> None:
+        self.points = checks.places(points)
+        count = len(self.points)
+        self.delta = _noise(noise_distance, count)
+        kinds = _kinds(kinds)
+        self.up = checks.direction(up, "up")
+        one = None if camera is None else checks.points(np.reshape(camera, (1, -1)), "camera", dims=3)
+        eye = None if one is None else np.asarray(one, float)[0]
+        self.rule = checks.choice(rule, "rule", ("likelihood", "gric", "paper"))
+        usual = "algebraic" if rule == "paper" else "geometric" if eye is None else "ray"
+        able = ("geometric", "algebraic") if rule == "paper" else ("ray", "geometric")
+        self.distance = checks.choice(distance or usual, f"distance with rule={rule!r}", able)
+        if self.distance == "ray" and eye is None:
+            raise ValueError("camera must be given with distance='ray', got None")
+        weight = checks.weights(weights, count)
+        self.weight = np.ones(count) if weight is None else np.asarray(weight, float)
+        along_ray = self.distance == "ray" or (rule == "paper" and eye is not None)
+        self.settings = Settings(
+            kinds, rule == "gric", along_ray, eye, self.points.dtype, capacity and capacity_for(capacity)
+        )
+        self._first: dict[bytes, Look | Status] = {}
+        self._further: dict[bytes, Look] = {}
+
+    def shapes(self, members: Sequence[np.ndarray], *, further: bool = True) -> tuple[Shape, ...]:
+        """The shape of each set.
+
+        Args:
+            members: Indices of the points of each set.
+            further: Whether what fits badly may be lying.
+        """
+        looks, poor = self._looks(members, further)
+        if self.rule != "paper":
+            return _shapes(looks, poor, [len(m) for m in members], self.settings)
+        shapes = []
+        for i, m in enumerate(members):
+            if i in looks:
+                own = None if self.delta is None else self.delta[m]
+                found = np.asarray(self.points)[m], self.weight[m], own, looks[i], self.up, self.settings, self.distance
+                shapes.append(_by_most_points(*found))
+            else:
+                arrays, told = _unknown(len(m), None, poor[i], self.settings)
+                shapes.append(Shape(**jax.device_put(arrays), **told))
+        return tuple(shapes)
+
+    def shapes_as(self, members: Sequence[np.ndarray], kinds: Sequence[str]) -> tuple[Shape, ...]:
+        """The shapes of sets as other kinds, one each, from what was found of these kinds."""
+        looks, poor = self._looks(members, True)
+        again = side_by_side(lambda i: look_as(looks[i], kinds[i], self.settings), looks)
+        return self._one_by_one(dict(zip(looks, again, strict=True)), poor, members, kinds)
+
+    def shapes_about(
+        self, members: Sequence[np.ndarray], kinds: Sequence[str], up: np.ndarray, leans: Sequence[float]
+    ) -> tuple[Shape, ...]:
+        """The shapes of sets as kinds, one each, with axes that lean from a vertical with so large a standard deviation."""
+        looks, poor = self._looks(members, True)
+
+        def again(i: int) -> Look:
+            look, kind = looks[i], KINDS.index(kinds[i])
+            look = look if look.fitted.kind == kind else look_as(look, kinds[i], self.settings)
+            return look_about(look, up, leans[i], self.settings)
+
+        found = side_by_side(again, looks)
+        return self._one_by_one(dict(zip(looks, found, strict=True)), poor, members, kinds)
+
+    def _one_by_one(
+        self, looks: dict[int, Look], poor: list[Status], members: Sequence[np.ndarray], kinds: Sequence[str]
+    ) -> tuple[Shape, ...]:
+        shapes = _shapes(looks, poor, [len(m) for m in members], self.settings)
+        # Of other kinds it is not asked.
+        scores = [
+            {k: s for k, s in shape.scores.items() if k == kind} for shape, kind in zip(shapes, kinds, strict=True)
+        ]
+        return tuple(dataclasses.replace(s, scores=own, guards=()) for s, own in zip(shapes, scores, strict=True))
+
+    def _looks(self, members: Sequence[np.ndarray], further: bool) -> tuple[dict[int, Look], list[Status]]:
+        """Looks at sets that have one, and why the others have none."""
+        keys = [hashlib.blake2b(m.tobytes(), digest_size=16).digest() for m in members]
+        items = {key: self._prepared(m) for key, m in zip(keys, members, strict=True) if key not in self._first}
+        poor = {key: unfit(item) for key, item in items.items()}
+        good = {key: item for key, item in items.items() if item is not None and not poor[key]}
+        if good and not self.settings.capacity:
+            most = max(len(item.points) for item in good.values())
+            self.settings = self.settings._replace(capacity=capacity_for(min(most, MOST)))
+        found = first_looks(list(good.values()), self.settings)
+        self._first |= poor | dict(zip(good, found, strict=True))
+        known = {key: look for key in keys if isinstance(look := self._first[key], Look)}
+        if further:
+            ahead = {key: look for key, look in known.items() if key not in self._further}
+            self._further |= dict(zip(ahead, further_looks(list(ahead.values()), self.settings), strict=True))
+        known |= {key: self._further[key] for key in known if key in self._further}
+        why = [Status(0) if isinstance(look := self._first[key], Look) else look for key in keys]
+        return {i: known[key] for i, key in enumerate(keys) if key in known}, why
+
+    def _prepared(self, own: np.ndarray) -> Prepared | None:
+        if not len(own):
+            return None
+        points = np.asarray(self.points).take(own, axis=0).astype(float)
+        deviation = None if self.delta is None else self.delta[own] / DEVIATIONS
+        return prepared(points, self.weight[own], deviation, self.up, self.settings.camera, self.settings.along_ray)
 
 
 def with_quadrics(
@@ -329,21 +387,12 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 
 
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
-    """Shapes of all objects; primitives of one kind are made together, and all arrays handed to JAX at once."""
-    good = {i: look for i, look in looks.items() if not look.reason}
-    seen = {i: judged(look.item, look.fitted, settings.along_ray) for i, look in good.items()}
-    same = {kind: [i for i, o in good.items() if KINDS[o.fitted.kind] == kind] for kind in KINDS}
-    parts = [(kind, part) for kind, own in same.items() for part in batches(own)]
-    surfaces = [(kind, *_surfaces([good[i] for i in part], [seen[i] for i in part], settings)) for kind, part in parts]
-    made: dict[int, tuple[Primitive, np.ndarray]] = {}
-    # For the sake of the first call, which compiles every kind.
-    assembled = side_by_side(lambda s: jax.device_get(assemble_batch(*s)), surfaces)
-    for (_, part), found in zip(parts, assembled, strict=True):
-        made |= {i: jax.tree.map(lambda a, j=j: a[j], found) for j, i in enumerate(part)}
+    """Shapes of all objects, their arrays handed to JAX at once."""
+    made = bounded(looks, settings)
     arrays, rest = [], []
     for i, size in enumerate(sizes):
         if i in made:
-            own, told = _named(looks[i], seen[i], *made[i], settings)
+            own, told = _named(looks[i], made[i], settings)
         else:
             own, told = _unknown(size, looks.get(i), Status(poor[i] or looks[i].reason), settings)
         arrays.append(own)
@@ -351,46 +400,12 @@ def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settin
     return tuple(Shape(**own, **told) for own, told in zip(jax.device_put(arrays), rest, strict=True))
 
 
-def _on(look: Look, seen: Judged) -> np.ndarray:
-    """Which points lie on the surface, in the order of the search: those whose noise membership is not the larger."""
-    scale = 1.0 if look.item.given else float(look.fitted.polished.scale)
-    return (seen.square <= (DEVIATIONS * scale) ** 2) & (look.item.weight > 0)
-
-
-def _ends(look: Look, seen: Judged) -> np.ndarray:
-    item, polished = look.item, look.fitted.polished
-    hits = (item.points + seen.depth[:, None] * item.rays) @ polished.turn.T
-    kind = KINDS[look.fitted.kind]
-    return bounds.ends_of(
-        kind,
-        np.asarray(polished.theta),
-        hits,
-        seen.part,
-        _on(look, seen),
-        np.asarray(look.fitted.detail),
-        np.asarray(polished.turn),
-    )
-
-
-def _surfaces(looks: list[Look], seen: list[Judged], settings: Settings) -> tuple[Any, ...]:
-    """What primitives of one kind are made of, padded by repetition to one compiled size."""
-    ends = [_ends(look, judgement) for look, judgement in zip(looks, seen, strict=True)]
-    rows = [*range(len(looks)), *[0] * (BATCH - len(looks))]
-    stack = lambda of: np.stack([np.asarray(of(i), settings.dtype) for i in rows])
-    frame = Frame(*(stack(lambda i, f=f: getattr(looks[i].item.frame, f)) for f in Frame._fields))
-    polished = lambda name: stack(lambda i: getattr(looks[i].fitted.polished, name))
-    detail = stack(lambda i: looks[i].fitted.detail)
-    return polished("theta"), polished("covariance"), polished("turn"), detail, stack(lambda i: ends[i]), frame
-
-
-def _named(
-    look: Look, seen: Judged, primitive: Primitive, covariance: np.ndarray, settings: Settings
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def _named(look: Look, made: Bounded, settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     """The fields of a shape that has a name: those that are arrays, and the rest."""
     item, fitted = look.item, look.fitted
     kind = KINDS[fitted.kind]
     inliers = np.zeros(len(item.points), bool)
-    inliers[item.order] = _on(look, seen)
+    inliers[item.order] = made.on
     scores, margin, guards = _told(fitted, settings.kinds)
     status = look.scattered | (Status.MAY_BE_BOX if kind == "plane" else Status(0))
     if margin < NARROW:
@@ -400,10 +415,10 @@ def _named(
     scale = 1.0 if item.given else float(fitted.polished.scale)
     deviation = item.typical * fitted.deviation * item.frame.unit * scale
     arrays = {
-        "primitive": primitive,
+        "primitive": made.primitive,
         "inliers": inliers,
         "noise_distance": np.asarray(DEVIATIONS * deviation, settings.dtype),
-        "covariance": covariance,
+        "covariance": made.covariance,
         "status": np.asarray(status, np.int32),
     }
     return arrays, {"kind": kind, "scores": scores, "margin": margin, "counts": {}, "guards": guards}

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.evidence import PIXELS_PER_POINT
 from jaxfuzzy.ground import Ground
 from jaxfuzzy.linalg import tangents
+from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.planes import deviation_across, noise_of
 from jaxfuzzy.primitives import Box, Cone, Cylinder
 from jaxfuzzy.shapes import Shape
@@ -145,29 +145,27 @@ def witness_of(
 
 
 def upright_again(
-    shapes: Sequence[Shape], vertical: Vertical, fit: Callable[[Sequence[int], str, float], Sequence[Shape]]
+    shapes: Sequence[Shape], vertical: Vertical, fit: Callable[[Sequence[int], float], Sequence[Shape]]
 ) -> tuple[Shape, ...]:
     """The upright objects fitted once more about the vertical, as what they were named; scores stay those of the choice.
 
     Args:
         shapes: All objects.
         vertical: What they agree on.
-        fit: Fits some of them as one kind, with the deviation of their leans.
+        fit: Fits some of them as the kinds that they are, with the deviation of their leans.
     """
-    new = list(shapes)
-    for kind in sorted({shapes[i].kind for i in vertical.upright}):
-        own = [i for i in vertical.upright if shapes[i].kind == kind]
-        for i, found in zip(own, fit(own, kind, float(np.hypot(vertical.lean, vertical.std))), strict=True):
-            # What cannot stand as upright as the others stays as it is.
-            if found.kind == kind and np.asarray(found.inliers).mean() >= LEAST_SHARE:
-                status = int(shapes[i].status) | int(found.status) & Status.NOT_CONVERGED
-                new[i] = dataclasses.replace(
-                    shapes[i],
-                    primitive=found.primitive,
-                    inliers=found.inliers,
-                    covariance=found.covariance,
-                    status=jnp.asarray(status, jnp.int32),
-                )
+    new, own = list(shapes), vertical.upright
+    for i, found in zip(own, fit(own, float(np.hypot(vertical.lean, vertical.std))), strict=True):
+        # What cannot stand as upright as the others stays as it is.
+        if found.kind == shapes[i].kind and np.asarray(found.inliers).mean() >= LEAST_SHARE:
+            status = int(shapes[i].status) | int(found.status) & Status.NOT_CONVERGED
+            new[i] = dataclasses.replace(
+                shapes[i],
+                primitive=found.primitive,
+                inliers=found.inliers,
+                covariance=found.covariance,
+                status=jnp.asarray(status, jnp.int32),
+            )
     return tuple(new)
 
 

@@ -13,7 +13,8 @@ ORDER = """
     arrays status checks files linalg memberships tiles solve alternation blocks fcm embedding
     varietystep varietyresult varietyblocks varieties conditioning
     seeding validity density segment meshes primitives refine recover bodies simulate
-    objects rays bounds starts local choice candidates screening finalists search polish fitting looks mostpoints quadrics
+    objects rays bounds starts local choice candidates screening finalists search polish fitting looks assembly mostpoints
+    quadrics
     shapes groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
     outline pieces occlusion evidence rivals vertical scene losses tuning sensitivity drawing plot export folder page report table

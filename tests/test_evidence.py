@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.choice import PLANE_BONUS
-from jaxfuzzy.evidence import FEWEST_PIXELS, HOLDS, NARROW, PIXELS_PER_POINT, TELLS, in_independent_points, told_apart
+from jaxfuzzy.evidence import FEWEST_PIXELS, HOLDS, NARROW, TELLS, in_independent_points, told_apart
+from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.primitives import Cylinder, Plane
 from jaxfuzzy.shapes import GUARDS
 from jaxfuzzy.status import Status

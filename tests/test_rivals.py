@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfuzzy.evidence import PIXELS_PER_POINT, TELLS
+from jaxfuzzy.evidence import TELLS
+from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.outline import sight_of
 from jaxfuzzy.primitives import Box, Cylinder
 from jaxfuzzy.rivals import chosen_by_outline
@@ -37,8 +38,9 @@ def chosen(missing, scores, rival=HALF, guards=()):
     points, own = scene(missing)
     asked = []
 
-    def again(of, kind):
+    def again(of, kinds):
         assert of == [0]
+        (kind,) = kinds
         asked.append(kind)
         return (shape_of(rival, len(own), {kind: scores[kind]}),)
 
