@@ -20,13 +20,13 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import lengths
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
-from jaxfuzzy.primitives import Cone, Cylinder, Primitive, Sphere
+from jaxfuzzy.primitives import Box, Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import FAMILIES, Shape
 from jaxfuzzy.status import Status
 
 K = TypeVar("K")
-# Fits shapes to sets of points given by their indices; of shares of larger sets it is told these too.
+# Fits shapes to sets of points given by their indices; of shares of larger sets it is told these too, and which sets may be lying.
 Fit = Callable[..., tuple[Shape, ...]]
 # Labels by places of the points with these indices.
 Parted = Callable[[np.ndarray], np.ndarray]
@@ -39,6 +39,8 @@ ASKED = 2048
 # Only neighbours are tried together: centers nearer than this share of the sum of their reaches, or than the second one where
 # something hides most of so many stops on the way between them that are on neither; and so many pairs at most.
 NEAR, FAR, STOPS, MOST_PAIRS = 1.0, 4.0, 12, 16
+# The middle of a part of a round body is within so many radii of its axis; cosine from which on an axis is upright.
+REACHES, UPRIGHT = 1.5, 0.95
 # For that a fair share of all points is looked at: so many, and less than twice as many.
 LOOKED_AT = 12_000
 # Of what a part's own surface holds, the joint one must hold this share; of a part without a surface, this share of its points.
@@ -82,10 +84,10 @@ def by_shapes(
     parts, shapes, gathered = _gathered(points, parts, shapes, fit)
     members = members_of(parts)
     flat = points @ across.T
-    joined = _joined(points, flat, members, shapes, fit, camera)
+    up = np.cross(*across)
+    joined = _joined(points, flat, members, shapes, fit, camera, up)
     taken = gathered.union(*joined)
-    height = points @ np.cross(*across)
-    divided = _divided(points, flat, height[:, None], members, shapes, taken, fit, least)
+    divided = _divided(points, flat, up, members, shapes, taken, fit, least)
     divided |= _peeled(points, members, shapes, taken.union(divided), fit, parted, least)
     if not joined and not divided:
         return parts, shapes
@@ -179,9 +181,10 @@ def _joined(
     shapes: Sequence[Shape],
     fit: Fit,
     camera: np.ndarray | None,
+    up: np.ndarray,
 ) -> dict[tuple[int, int], tuple[np.ndarray, Shape]]:
     """Pairs of groups that one surface holds, and that surface; each group is in one pair at most."""
-    able = [k for k, own in enumerate(members) if len(own) >= FEWEST]
+    able = [k for k, own in enumerate(members) if len(own) >= FEWEST and not _hopeless(shapes[k])]
     middle = {k: np.median(flat[members[k]], axis=0) for k in able}
     reach = {k: np.quantile(lengths(flat[members[k]] - middle[k]), 0.9) for k in able}
     apart = {
@@ -191,13 +194,21 @@ def _joined(
         if a < b
     }
     view = None if camera is None or len(members) < 3 else _seen_from(camera, points, members)
-    able_pairs = (p for p in apart if apart[p] < NEAR or (apart[p] < FAR and view is not None and _way_hidden(view, p)))
+    centers = {k: np.median(points[members[k]], axis=0) for k in able}
+    able_pairs = (
+        (a, b)
+        for (a, b), away in apart.items()
+        if (away < NEAR or (away < FAR and view is not None and _way_hidden(view, (a, b))))
+        and (_reaches(shapes[a].primitive, centers[b]) or _reaches(shapes[b].primitive, centers[a]))
+    )
     pairs = sorted(able_pairs, key=apart.__getitem__)[:MOST_PAIRS]
     # Stable sorting takes advantage of each being in order already.
     both = [np.sort(np.concatenate([members[a], members[b]]), kind="stable") for a, b in pairs]
     good: list[tuple[float, tuple[int, int], np.ndarray]] = []
     some = [_some(own) for own in both]
-    for (a, b), of, own, shape in zip(pairs, some, both, fit(some, both) if both else (), strict=True):
+    # The parts of what lies lie too.
+    lying = [any(_lies(shapes[k].primitive, up) for k in pair) for pair in pairs]
+    for (a, b), of, own, shape in zip(pairs, some, both, fit(some, both, lying) if both else (), strict=True):
         families = {FAMILIES.get(shapes[k].kind) for k in (a, b)}
         # Two parts that are flat are no part of a cone.
         if shape.primitive is None or (len(families) == 1 and not families <= {None, FAMILIES.get(shape.kind)}):
@@ -215,6 +226,36 @@ def _joined(
         if not {i for p in chosen for i in p} & set(pair):
             chosen[pair] = own
     return _named(chosen, fit)
+
+
+def _hopeless(shape: Shape) -> bool:
+    """Whether even the surface that fits a group best does not, so that none that fits more than it can."""
+    status = int(shape.status)
+    other = Status.TOO_FEW_POINTS | Status.DEGENERATE | Status.SEEN_THROUGH
+    return shape.primitive is None and bool(status & Status.REFUSED) and not status & other
+
+
+def _reaches(body: Primitive | None, place: np.ndarray) -> bool:
+    """Whether a place may be on the same body: what is round holds within its radius whatever else is part of it."""
+    if isinstance(body, Sphere):
+        return float(np.linalg.norm(place - np.asarray(body.center))) <= REACHES * float(body.radius)
+    if isinstance(body, Cylinder | Cone):
+        start = np.asarray(body.base if isinstance(body, Cylinder) else body.apex)
+        offset, axis = place - start, np.asarray(body.axis)
+        along = offset @ axis
+        widest = (
+            float(body.height[1]) * np.tan(float(body.half_angle)) if isinstance(body, Cone) else float(body.radius)
+        )
+        radius = max(widest, abs(along) * np.tan(float(body.half_angle))) if isinstance(body, Cone) else widest
+        return float(np.linalg.norm(offset - along * axis)) <= REACHES * radius
+    return True
+
+
+def _lies(body: Primitive | None, up: np.ndarray) -> bool:
+    """Whether no axis of a body is upright."""
+    if isinstance(body, Box):
+        return bool(np.abs(np.asarray(body.axes) @ up).max() < UPRIGHT)
+    return isinstance(body, Cylinder | Cone) and abs(float(np.asarray(body.axis) @ up)) < UPRIGHT
 
 
 def _some(own: np.ndarray, count: int = TRIED) -> np.ndarray:
@@ -288,7 +329,7 @@ def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Sha
 def _divided(
     points: np.ndarray,
     flat: np.ndarray,
-    height: np.ndarray,
+    up: np.ndarray,
     members: Sequence[np.ndarray],
     shapes: Sequence[Shape],
     taken: set[int],
@@ -303,6 +344,7 @@ def _divided(
     ]
     # Places make the first cut, across the ground and in height; the two surfaces it gives the second. What is seen through is not
     # cut in height: parts of a ring lie on surfaces as well as the whole does, and are seen through no more.
+    height = (points @ up)[:, None]
     ways = {k: (flat,) if int(shapes[k].status) & Status.SEEN_THROUGH else (flat, height) for k in able}
     cuts = {(k, way): _side(of[members[k]]) for k in able for way, of in enumerate(ways[k])}
     good: dict[int, tuple[float, list[np.ndarray]]] = {}
@@ -311,16 +353,13 @@ def _divided(
         pieces = {
             c: two for c, two in pieces.items() if min(map(len, two)) >= max(fewest, SMALLEST * sum(map(len, two)))
         }
-        sets = [piece for two in pieces.values() for piece in two]
-        some = [_some(piece) for piece in sets]
-        found = iter(zip(some, fit(some, sets) if sets else (), strict=True))
-        for (k, way), two in pieces.items():
-            both = [next(found) for _ in two]
+        least = {k: max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k])) for k in able}
+        lying = {cut: _lies(shapes[cut[0]].primitive, up) for cut in pieces}
+        for ((k, way), two), both in zip(pieces.items(), _of_pieces(pieces, least, lying, fit), strict=True):
             count = sum(_held(shape) / len(of) * len(piece) for piece, (of, shape) in zip(two, both, strict=True))
             named = [(shape, shape.primitive) for _, shape in both if shape.primitive is not None]
-            least = max(EXPLAINED * len(members[k]), _held(shapes[k]) + GAINED * len(members[k]))
             inner = _contained(points, [of for of, _ in both], [shape for _, shape in both])
-            if len(named) == 2 and not inner and count >= max(least, good[k][0] if k in good else 0.0):
+            if len(named) == 2 and not inner and count >= max(least[k], good[k][0] if k in good else 0.0):
                 good[k] = count, two
             if len(named) == 2:
                 away = [distances(primitive, points[members[k]]) for _, primitive in named]
@@ -331,6 +370,36 @@ def _divided(
         cuts = {cut: side for cut, side in cuts.items() if cut in pieces}
     whole = _named({(k, i): piece for k, (_, two) in good.items() for i, piece in enumerate(two)}, fit)
     return {k: [whole[k, 0], whole[k, 1]] for k in good if (k, 0) in whole and (k, 1) in whole}
+
+
+def _of_pieces(
+    pieces: dict[tuple[int, int], list[np.ndarray]],
+    least: dict[int, float],
+    lying: dict[tuple[int, int], bool],
+    fit: Fit,
+) -> list[list[tuple[np.ndarray, Shape]]]:
+    """For each cut the shapes of its two pieces, and which share of their points these were fitted to.
+
+    One that has none upright is looked at once more where the other has one and both together may then hold enough.
+    """
+    sets = [piece for two in pieces.values() for piece in two]
+    some = [_some(piece) for piece in sets]
+    found = list(fit(some, sets, [may for may in lying.values() for _ in (0, 1)])) if sets else []
+    again = []
+    for i, (k, _) in enumerate(pieces):
+        for one, other in ((2 * i, 2 * i + 1), (2 * i + 1, 2 * i)):
+            held = _held(found[other]) / len(some[other]) * len(sets[other])
+            if (
+                found[one].primitive is None
+                and found[other].primitive is not None
+                and held + len(sets[one]) >= least[k]
+            ):
+                again.append(one)
+    more = fit([some[i] for i in again], [sets[i] for i in again], [True] * len(again)) if again else ()
+    for i, shape in zip(again, more, strict=True):
+        found[i] = shape
+    each = list(zip(some, found, strict=True))
+    return [each[i : i + 2] for i in range(0, len(each), 2)]
 
 
 def _peeled(

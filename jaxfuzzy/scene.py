@@ -254,7 +254,9 @@ def _model(
         correlated = cloud.pixels_px is not None and shape_rule != "paper"
 
         def fit(
-            sets: Sequence[np.ndarray], wholes: Sequence[np.ndarray] | None = None, further: bool = True
+            sets: Sequence[np.ndarray],
+            wholes: Sequence[np.ndarray] | None = None,
+            further: Sequence[bool] | None = None,
         ) -> tuple[Shape, ...]:
             found = fits.shapes(sets, further=further)
             if sight is None:

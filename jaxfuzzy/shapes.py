@@ -219,12 +219,12 @@ class Fits:
         self._first: dict[bytes, Look | Status] = {}
         self._further: dict[bytes, Look] = {}
 
-    def shapes(self, members: Sequence[np.ndarray], *, further: bool = True) -> tuple[Shape, ...]:
+    def shapes(self, members: Sequence[np.ndarray], *, further: Sequence[bool] | None = None) -> tuple[Shape, ...]:
         """The shape of each set.
 
         Args:
             members: Indices of the points of each set.
-            further: Whether what fits badly may be lying.
+            further: Which of them may be lying where they fit badly; all by default.
         """
         looks, poor = self._looks(members, further)
         if self.rule != "paper":
@@ -242,7 +242,7 @@ class Fits:
 
     def shapes_as(self, members: Sequence[np.ndarray], kinds: Sequence[str]) -> tuple[Shape, ...]:
         """The shapes of sets as other kinds, one each, from what was found of these kinds."""
-        looks, poor = self._looks(members, True)
+        looks, poor = self._looks(members)
         again = side_by_side(lambda i: look_as(looks[i], kinds[i], self.settings), looks)
         return self._one_by_one(dict(zip(looks, again, strict=True)), poor, members, kinds)
 
@@ -250,7 +250,7 @@ class Fits:
         self, members: Sequence[np.ndarray], kinds: Sequence[str], up: np.ndarray, leans: Sequence[float]
     ) -> tuple[Shape, ...]:
         """The shapes of sets as kinds, one each, with axes that lean from a vertical with so large a standard deviation."""
-        looks, poor = self._looks(members, True)
+        looks, poor = self._looks(members)
 
         def again(i: int) -> Look:
             look, kind = looks[i], KINDS.index(kinds[i])
@@ -270,7 +270,9 @@ class Fits:
         ]
         return tuple(dataclasses.replace(s, scores=own, guards=()) for s, own in zip(shapes, scores, strict=True))
 
-    def _looks(self, members: Sequence[np.ndarray], further: bool) -> tuple[dict[int, Look], list[Status]]:
+    def _looks(
+        self, members: Sequence[np.ndarray], further: Sequence[bool] | None = None
+    ) -> tuple[dict[int, Look], list[Status]]:
         """Looks at sets that have one, and why the others have none."""
         keys = [hashlib.blake2b(m.tobytes(), digest_size=16).digest() for m in members]
         items = {key: self._prepared(m) for key, m in zip(keys, members, strict=True) if key not in self._first}
@@ -282,9 +284,9 @@ class Fits:
         found = first_looks(list(good.values()), self.settings)
         self._first |= poor | dict(zip(good, found, strict=True))
         known = {key: look for key in keys if isinstance(look := self._first[key], Look)}
-        if further:
-            ahead = {key: look for key, look in known.items() if key not in self._further}
-            self._further |= dict(zip(ahead, further_looks(list(ahead.values()), self.settings), strict=True))
+        wanted = {key for i, key in enumerate(keys) if further is None or further[i]}
+        ahead = {key: look for key, look in known.items() if key in wanted and key not in self._further}
+        self._further |= dict(zip(ahead, further_looks(list(ahead.values()), self.settings), strict=True))
         known |= {key: self._further[key] for key in known if key in self._further}
         why = [Status(0) if isinstance(look := self._first[key], Look) else look for key in keys]
         return {i: known[key] for i, key in enumerate(keys) if key in known}, why

@@ -194,9 +194,10 @@ def test_a_set_is_searched_once_and_known_as_other_kinds_and_about_other_vertica
     count, fit = [], fitting.fit
     monkeypatch.setattr(fitting, "fit", lambda *args: count.append(0) or fit(*args))
     fits = Fits(points, camera=CAMERA, noise_distance=noise)
-    first = fits.shapes(sets, further=False)
+    no = [False] * len(sets)
+    first = fits.shapes(sets, further=no)
     assert len(count) == len(sets)
-    again = fits.shapes(sets[::-1], further=False)[::-1]
+    again = fits.shapes(sets[::-1], further=no)[::-1]
     assert len(count) == len(sets)
     assert [s.kind for s in again] == [s.kind for s in first]
     fits.shapes(sets)
