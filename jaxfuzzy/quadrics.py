@@ -16,6 +16,8 @@ LADDER, STEPS = (16.0, 8.0, 4.0, 2.0, 1.0), 6
 # Of the points near a quadric, up to so many noise distances, no larger share than this may lie beyond one noise distance; of all
 # points so many must lie within it. On simulated clouds ellipsoids and saddles stay mostly below, tori and blobs are above.
 NEAR, BEYOND, LEAST = 2.4, 0.14, 0.4
+# A fair sample of so many points is fitted, and all are judged.
+FITTED_TO = 2048
 
 
 def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -> tuple[Quadric, np.ndarray] | None:
@@ -34,7 +36,7 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
     if unit == 0:
         return None
     p = (points - middle) / unit
-    some = np.flatnonzero(real)[fair_order(p[real])[:MOST]]
+    some = np.flatnonzero(real)[fair_order(p[real])[:FITTED_TO]]
     embedded, slopes = _terms(p[some])
     delta, square = noise_distance / unit, np.zeros(len(some))
     for step in np.repeat(LADDER, STEPS):

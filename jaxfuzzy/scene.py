@@ -16,7 +16,7 @@ from jaxfuzzy.arrays import Array, Float, Int, lengths, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
 from jaxfuzzy.ground import fit_ground, foreground
-from jaxfuzzy.groups import FEWEST, by_shapes, members_of
+from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
@@ -31,6 +31,7 @@ from jaxfuzzy.rivals import chosen_by_outline
 from jaxfuzzy.segment import Segmentation, segment
 from jaxfuzzy.shapes import Fits, Shape, with_quadrics
 from jaxfuzzy.stereo import reconstruct
+from jaxfuzzy.trials import FEWEST
 from jaxfuzzy.vertical import agreed_vertical, upright_again, witness_of
 
 # Noise distance in standard deviations of a point along its viewing ray: farther points rather belong to noise.

@@ -173,13 +173,7 @@ class Fits:
 
     Args:
         points: Points (N, 3) in metres.
-        noise_distance: As in `fit_shape`; so are the others.
-        kinds: See there.
-        up: See there.
-        camera: See there.
-        distance: See there.
-        rule: See there.
-        weights: See there.
+        noise_distance, kinds, up, camera, distance, rule, weights: As in `fit_shape`.
         capacity: Points that a set is fitted to at most; 0 to choose by the first sets. Larger sets are fitted to a fair sample,
             and all their points judged.
     """

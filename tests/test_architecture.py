@@ -15,7 +15,7 @@ ORDER = """
     seeding validity density segment meshes primitives refine recover bodies simulate
     objects rays bounds starts local choice candidates screening finalists search polish fitting looks assembly mostpoints
     quadrics
-    shapes groups
+    shapes trials joining dividing groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
     outline pieces occlusion evidence rivals vertical scene losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.checks import DataError
-from jaxfuzzy.groups import _seen_from, _way_hidden, by_shapes
+from jaxfuzzy.dividing import _of_pieces
+from jaxfuzzy.groups import by_shapes
+from jaxfuzzy.joining import _seen_from, _way_hidden, parts_of_one_body
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
 from jaxfuzzy.status import Status
@@ -31,7 +33,7 @@ def shape_of(points, body, noise=0.005):
 def fitted_to(points, bodies):
     """Takes for every set the body that holds most of it."""
 
-    def fit(sets, wholes=None):
+    def fit(sets, wholes=None, lying=None):
         best = lambda own: max((shape_of(points[own], s) for s in bodies), key=lambda s: int(s.inliers.sum()))
         return tuple(best(own) for own in sets)
 
@@ -181,6 +183,69 @@ def test_a_vessel_in_one_group_is_not_divided():
         points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)]), fit, by_places(points)
     )
     assert same is parts
+
+
+@pytest.mark.parametrize(
+    ("status", "tried"),
+    [(Status(0), False), (Status.REFUSED, False), (Status.REFUSED | Status.TOO_FEW_POINTS, True)],
+)
+def test_pairs_that_no_surface_can_hold_are_not_tried(status, tried):
+    """Two balls side by side, both named, or one refused: since its best surface does not fit it, or for lack of points."""
+    points = np.concatenate([ball([-0.065, 0, 1.0], 0.08), ball([0.065, 0, 1.0], 0.08)])
+    bodies = [Sphere(jnp.array([x, 0, 1.0]), jnp.asarray(0.08)) for x in (-0.065, 0.065)]
+    labels = np.repeat([0, 1], len(points) // 2)
+    members = [np.flatnonzero(labels == k) for k in range(2)]
+    asked, fit = [], fitted_to(points, bodies)
+    shapes = list(fit(members))
+    if status:
+        shapes[1] = dataclasses.replace(shapes[1], primitive=None, kind="unknown", status=jnp.asarray(int(status)))
+
+    def listen(sets, wholes=None, lying=None):
+        asked.extend(len(own) for own in sets)
+        return fit(sets)
+
+    joined = parts_of_one_body(points, points @ ACROSS.T, members, shapes, listen, None, np.array([0, 1.0, 0]))
+    assert not joined
+    assert asked == ([len(points)] if tried else [])
+
+
+@pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
+def test_parts_of_what_lies_are_asked_for_as_lying(axis):
+    rng = np.random.default_rng(0)
+    turn, along = rng.uniform(0, np.pi, 600), np.concatenate([rng.uniform(0, 0.1, 300), rng.uniform(0.1, 0.2, 300)])
+    first, second = (np.roll(axis, i) for i in (1, 2))
+    points = np.array([0, 0, 1.0]) + along[:, None] * axis
+    points = points + 0.05 * (np.cos(turn)[:, None] * first - np.sin(turn)[:, None] * second)
+    body = Cylinder(jnp.array([0, 0, 1.0]), jnp.array(axis), jnp.asarray(0.05), jnp.asarray(0.2))
+    members = [np.arange(300), np.arange(300, 600)]
+    fit, flags = fitted_to(points, [body]), []
+
+    def listen(sets, wholes=None, lying=None):
+        flags.append(lying)
+        return fit(sets)
+
+    joined = parts_of_one_body(points, points @ ACROSS.T, members, fit(members), listen, None, np.array([0, 1.0, 0]))
+    assert list(joined) == [(0, 1)]
+    # At first the pair, then once more those that were taken.
+    assert flags[0] == [axis[1] == 0]
+
+
+def test_a_piece_is_looked_at_as_lying_where_its_other_piece_is_named():
+    """Of three groups' halves: both named, the second unnamed but needed, the second unnamed and too small to matter."""
+    starts = (0, 500, 1000, 1500, 2000, 2500)
+    sets = [np.arange(start, start + (60 if start == 2500 else 500)) for start in starts]
+    pieces = {(k, 0): sets[2 * k : 2 * k + 2] for k in range(3)}
+    good = fitted_shape(Sphere(jnp.zeros(3), jnp.asarray(0.1)), np.ones(500, bool), 0.004)
+    bad = fitted_shape(None, np.zeros(500, bool), 0.004)
+    calls = []
+
+    def fit(some, wholes, lying):
+        calls.append(([int(own[0]) for own in some], lying))
+        return [bad if own[0] in (1500, 2500) and not any(lying) else good for own in some]
+
+    found = _of_pieces(pieces, {0: 900, 1: 900, 2: 700}, dict.fromkeys(pieces, False), fit)
+    assert calls == [(list(starts), [False] * 6), ([1500], [True])]
+    assert [[shape is good for _, shape in both] for both in found] == [[True, True], [True, True], [True, False]]
 
 
 def test_halves_far_apart_are_merged_where_something_hides_what_is_between():
