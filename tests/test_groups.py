@@ -215,8 +215,8 @@ def test_parts_of_what_lies_are_asked_for_as_lying(axis):
     turn, along = rng.uniform(0, np.pi, 600), np.concatenate([rng.uniform(0, 0.1, 300), rng.uniform(0.1, 0.2, 300)])
     first, second = (np.roll(axis, i) for i in (1, 2))
     points = np.array([0, 0, 1.0]) + along[:, None] * axis
-    points = points + 0.05 * (np.cos(turn)[:, None] * first - np.sin(turn)[:, None] * second)
-    body = Cylinder(jnp.array([0, 0, 1.0]), jnp.array(axis), jnp.asarray(0.05), jnp.asarray(0.2))
+    points = points + 0.08 * (np.cos(turn)[:, None] * first - np.sin(turn)[:, None] * second)
+    body = Cylinder(jnp.array([0, 0, 1.0]), jnp.array(axis), jnp.asarray(0.08), jnp.asarray(0.2))
     members = [np.arange(300), np.arange(300, 600)]
     fit, flags = fitted_to(points, [body]), []
 
