@@ -6,7 +6,7 @@ whose viewing ray passes the surface within its ends has a say; what was not mat
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +45,8 @@ class Sight(NamedTuple):
         rays: Their directions (n, 3).
         depth: Their distances (n,).
         loose: Which of them belong to no object (n,).
+        known: What was seen through shapes that were asked for, each beside its primitive and inliers, by whose places in memory
+            and number of points it is found: later stages ask for the same ones again.
     """
 
     camera: np.ndarray
@@ -53,6 +55,7 @@ class Sight(NamedTuple):
     rays: np.ndarray
     depth: np.ndarray
     loose: np.ndarray
+    known: dict[tuple[int, int, int], tuple[Primitive, Any, "Through"]]
 
 
 def sight_of(points: np.ndarray, loose: np.ndarray, camera: np.ndarray, up: np.ndarray) -> Sight:
@@ -67,7 +70,7 @@ def sight_of(points: np.ndarray, loose: np.ndarray, camera: np.ndarray, up: np.n
     which = slice(None, None, max(1, len(points) // LOOKED_AT))
     offset = np.asarray(points[which] - camera, float)
     depth = lengths(offset)
-    return Sight(camera, up, which, offset / np.maximum(depth, 1e-12)[:, None], depth, loose[which])
+    return Sight(camera, up, which, offset / np.maximum(depth, 1e-12)[:, None], depth, loose[which], {})
 
 
 def without_seen_through(
@@ -118,13 +121,19 @@ def seen_through(
         sight: What the camera sees.
         whole: Indices of all points of the object, where the shape is that of a share of them.
     """
-    inliers = np.asarray(shape.inliers)
-    if shape.primitive is None or isinstance(shape.primitive, Quadric) or not inliers.any():
+    body, inliers = shape.primitive, np.asarray(shape.inliers)
+    if body is None or isinstance(body, Quadric) or not inliers.any():
         return Through(0.0, 0.0)
-    mine = np.zeros(len(points), bool)
-    mine[own if whole is None else whole] = True
-    held = np.asarray(points.take(own[inliers], axis=0), float)
-    return _through(shape.primitive, float(shape.noise_distance), held, mine[sight.which], sight)
+    whole = own if whole is None else whole
+    key = id(body), id(shape.inliers), len(whole)
+    if key not in sight.known:
+        mine = np.zeros(len(points), bool)
+        mine[whole] = True
+        held = np.asarray(points.take(own[inliers], axis=0), float)
+        through = _through(body, float(shape.noise_distance), held, mine[sight.which], sight)
+        # Kept with what it is of, so that no other takes that place in memory.
+        sight.known[key] = body, shape.inliers, through
+    return sight.known[key][2]
 
 
 def _through(body: Primitive, noise_distance: float, held: np.ndarray, mine: np.ndarray, sight: Sight) -> Through:
