@@ -54,8 +54,8 @@ def by_shapes(
     up = np.cross(*across)
     joined = parts_of_one_body(points, flat, members, shapes, fit, camera, up)
     taken = gathered.union(*joined)
-    divided = cut_in_two(points, flat, up, members, shapes, taken, fit, least)
-    divided |= with_left_over(points, members, shapes, taken.union(divided), fit, parted, least)
+    divided = with_left_over(points, members, shapes, taken, fit, parted, least)
+    divided |= cut_in_two(points, flat, up, members, shapes, taken.union(divided), fit, least)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []
