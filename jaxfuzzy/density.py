@@ -69,6 +69,7 @@ def part(
     box: Float[Array, "2 2"],
     bandwidth: Float[Array, ""],
     allowed: Bool[Array, " G"],
+    number: int,
 ) -> Groups | None:
     """Parts the places of a plane into groups; None where the prototypes do not suffice to tile it at this bandwidth.
 
@@ -78,8 +79,9 @@ def part(
         box: Lower and upper corner of the box that holds nearly all of them.
         bandwidth: Bandwidth h of the support.
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
+        number: How many places there are; the others are padding.
     """
-    survey = _survey(places, weights, box, bandwidth)
+    survey = _survey(places, weights, box, bandwidth, jnp.asarray(number))
     real = int(survey.real.sum())
     # One seed more than there are places for would say that the tiling is not whole.
     most = next((c for c in PROTOTYPES if real < c), None)
@@ -104,10 +106,11 @@ class Survey:
 
 
 @partial(jax.jit, compiler_options=WIDE)
-def _survey(places: Array, weights: Array, box: Array, bandwidth: Array) -> Survey:
+def _survey(places: Array, weights: Array, box: Array, bandwidth: Array, number: Array) -> Survey:
     queries = jnp.concatenate([places, _lattice(box, bandwidth)])
-    # Points of weight 0 are asked for too.
-    wanted = jnp.ones(len(queries), bool)
+    # Places of weight 0 are asked for too, padding is not.
+    index = jnp.arange(len(queries))
+    wanted = (index < number) | (index >= len(places))
     held, around = jnp.split(_supports(queries, wanted, places, weights, bandwidth[None])[0], [len(places)])
     background = jnp.median(around)
     least = (jnp.sqrt(background) + SEED_SIGMAS / 2) ** 2

@@ -60,7 +60,8 @@ APART, SLANT, AGREE = 0.3, 0.1, 0.65
 ROUND = ("cylinder", "cone", "sphere")
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
-
+# One more than there are processors, as Python prepares the next.
+AT_A_TIME = (os.cpu_count() or 1) + 1
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -203,7 +204,7 @@ def compiling_ahead(capacity: int, dtype: Any, along_ray: bool) -> Iterator[None
         dtype: Their type.
         along_ray: Whether residuals will be along the viewing ray.
     """
-    pool = threads(os.cpu_count() or 1)
+    pool = threads(AT_A_TIME)
     # What fails here fails again, aloud, in the search itself.
     ahead = [pool.submit(part, padded(None, capacity, dtype), along_ray) for part in fitting.PARTS]
     yield
@@ -224,8 +225,8 @@ def _threads(count: int, double: bool) -> ThreadPoolExecutor:
 
 
 def side_by_side(work: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """What compiled work makes of each item, as many at a time as there are processors; NumPy's own would only take turns."""
-    return list(threads(os.cpu_count() or 1).map(work, items))
+    """What compiled work makes of each item, some at a time; NumPy's own would only take turns."""
+    return list(threads(AT_A_TIME).map(work, items))
 
 
 def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[float] = ()) -> list[Look]:

@@ -129,6 +129,7 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
             box,
             jnp.asarray(bandwidth, x.dtype),
             allowed,
+            int(cell.max()) + 1,
         )
         if groups is not None and int(groups.count) >= able[0]:
             break

@@ -56,7 +56,7 @@ def test_tiling_is_noise_clustering():
     points, _ = blobs([(0, 0), (0.3, 0.1)])
     places, weights = points[:256, [0, 2]], np.linspace(0.5, 1.5, 256)
     h = 0.02
-    survey = density._survey(*map(jnp.asarray, (places, weights, np.array([[-0.1, -0.1], [0.4, 0.2]]), h)))
+    survey = density._survey(*map(jnp.asarray, (places, weights, np.array([[-0.1, -0.1], [0.4, 0.2]]), h, 256)))
     real = np.asarray(survey.real)
     assert 3 < real.sum() < 64
     prototypes, _ = density._tile(jnp.asarray(places), jnp.asarray(weights), jnp.asarray(h), survey.seeds, survey.real)
