@@ -25,7 +25,7 @@ MOST_ASKED, FEWEST_ASKED, SAMPLE = 128, 8, 32
 # at and what stands before it. Outliers are so sparse only where they are as many as the points of the shape.
 IN_FRONT, NEIGHBOURS = 4, 8
 # Of the points of a shape, and of those of none, so many are looked at.
-LOOKED_AT = 8192
+LOOKED_AT = 16_384
 # Nearer means by more than so many noise distances.
 CLEARLY = 2.0
 # An end is hidden when more than this share of the views beyond it is blocked.
