@@ -15,7 +15,19 @@ import numpy as np
 from jax.typing import ArrayLike as JaxArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-__all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Scalar", "as_float", "is_concrete", "record", "static"]
+__all__ = [
+    "Array",
+    "ArrayLike",
+    "Bool",
+    "Float",
+    "Int",
+    "Scalar",
+    "as_float",
+    "is_concrete",
+    "on_device",
+    "record",
+    "static",
+]
 
 ArrayLike = JaxArrayLike | Sequence[Any]
 Scalar = float | Float[Array, ""]
@@ -23,6 +35,16 @@ Scalar = float | Float[Array, ""]
 T = TypeVar("T")
 # Compiler's options: processors that have wide vectors are up to a quarter faster with them; it takes halves by default.
 WIDE = {"xla_cpu_prefer_vector_width": 512}
+
+
+def on_device(value: Any, dtype: Any = None) -> Array:
+    """An array that is put on the device as it is; `jnp.asarray` would compile a small program for every shape and type.
+
+    Args:
+        value: What NumPy makes an array of.
+        dtype: Its type; NumPy's own, in the precision of JAX, by default.
+    """
+    return jax.device_put(np.asarray(value, dtype))
 
 
 def static(**kwargs: Any) -> Any:

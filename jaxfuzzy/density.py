@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfuzzy.arrays import WIDE, Array, Bool, Float, Int, record
+from jaxfuzzy.arrays import WIDE, Array, Bool, Float, Int, on_device, record
 
 # Small clusters that tile the objects (the sizes compiled); neighbours each is compared with, at so many places on the way.
 PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
@@ -81,8 +81,8 @@ def part(
         allowed: Which numbers of groups 1, 2, ... are allowed; where the number found is not, the nearest that is.
         number: How many places there are; the others are padding.
     """
-    survey = _survey(places, weights, box, bandwidth, jnp.asarray(number))
-    real = int(survey.real.sum())
+    survey = _survey(places, weights, box, bandwidth, on_device(number))
+    real = int(np.asarray(survey.real).sum())
     # One seed more than there are places for would say that the tiling is not whole.
     most = next((c for c in PROTOTYPES if real < c), None)
     return None if most is None else _divide(places, weights, box, bandwidth, survey, allowed, most=most)

@@ -8,9 +8,9 @@ to no evidence is not named.
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import on_device
 from jaxfuzzy.choice import PLANE_BONUS
 from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.search import KINDS, MORE
@@ -64,7 +64,7 @@ def _in_independent_points(shape: Shape, fitted_to: int) -> Shape:
         shape,
         scores={kind: score / each for kind, score in shape.scores.items()},
         margin=shape.margin / each,
-        covariance=jnp.asarray(np.asarray(shape.covariance) * common, shape.covariance.dtype),
+        covariance=on_device(np.asarray(shape.covariance) * common, shape.covariance.dtype),
     )
 
 
@@ -73,7 +73,7 @@ def _told_apart(shape: Shape) -> Shape:
         return shape
     count = len(shape.inliers)
     status = int(shape.status) & ~Status.LOW_MARGIN | (Status.LOW_MARGIN if shape.margin < NARROW else 0)
-    shape = dataclasses.replace(shape, status=jnp.asarray(status, jnp.int32))
+    shape = dataclasses.replace(shape, status=on_device(status, np.int32))
     if count < FEWEST_PIXELS:
         return refused(shape, Status.TOO_FEW_POINTS, "too few pixels for the errors that they share")
     if np.asarray(shape.inliers).mean() < HOLDS:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, lengths, record
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, lengths, on_device, record
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.planes import (
     POINT_DELTA,
@@ -139,7 +139,6 @@ def fit_ground(
     view = view_of(x, w, ray, floor, axis, eye)
     prior = prior_of(axis, (0.0, max_tilt / 2, max_tilt), eye, dtype)
     best, scale = _fit(view, prior, (1.0, 2.0) if known else UNKNOWN_NOISE)
-    zero = jnp.zeros((), dtype)
     normal, offset, spread, inliers = np.zeros(3, dtype), 0.0, 0.0, np.zeros(len(x), bool)
     if best is not None:
         # An exact plane has no spread; rounding is the least there is.
@@ -148,22 +147,22 @@ def fit_ground(
         residual = (x @ normal - offset) / deviation_across(normal, ray, floor)
         inliers = (np.abs(residual) <= POINT_DELTA * spread) & (w > 0)
     if best is None or inliers.sum() < FEWEST:
-        none = jnp.zeros(len(x), bool)
+        none = on_device(np.zeros(len(x), bool))
         return Ground(
             None,
             none,
             jax.device_put(np.array(std)) if known else None,
-            zero + 1,
-            zero,
-            jnp.asarray(int(Status.NO_GROUND)),
+            on_device(1.0, dtype),
+            on_device(0.0, dtype),
+            on_device(int(Status.NO_GROUND), np.int32),
         )
     return Ground(
         _rectangle(x[inliers], normal, offset),
         jax.device_put(inliers),
         jax.device_put(std * spread),
-        zero + (spread if known else 1.0),
+        on_device(spread if known else 1.0, dtype),
         best.support,
-        jnp.asarray(int(Status.GROUND_SLAB) if known and spread > SLAB else 0),
+        on_device(int(Status.GROUND_SLAB) if known and spread > SLAB else 0, np.int32),
     )
 
 
@@ -195,7 +194,7 @@ def foreground(
     eye = None if camera is None else checks.position(camera, "camera").astype(x.dtype)
     std, known = _deviation(x, kept, "auto", ground.depth_std, eye)
     ray, floor = noise_of(x, std, eye)
-    cut, table, flat = jnp.zeros((), cloud.dtype), np.asarray(ground.inliers), np.zeros(len(x), bool)
+    cut, table, flat = on_device(0.0, cloud.dtype), np.asarray(ground.inliers), np.zeros(len(x), bool)
     axis = checks.direction(up, "up")
     if ground.plane is not None:
         axis = np.asarray(ground.plane.normal)
@@ -203,7 +202,7 @@ def foreground(
         least = ABOVE * deviation_across(axis, ray, floor)
         flat = height <= least
         kept &= ~flat
-        cut = jnp.asarray(np.median(least))
+        cut = on_device(np.median(least), cloud.dtype)
     prior = prior_of(axis, (np.pi / 2, np.pi / 9, np.pi * 2 / 9), eye, cloud.dtype, anywhere=True)
     walls: list[Plane] = []
     standing = kept.copy()
@@ -256,7 +255,7 @@ def _fit(view: View, prior: Prior, scales: tuple[float, ...]) -> tuple[Candidate
     """The best plane at the smallest noise at which there is one that is no slab; and the factor on the noise."""
     best, factor = None, 1.0
     for scale in scales:
-        found = fit_plane(view, prior, jnp.asarray(scale, view.points.dtype))
+        found = fit_plane(view, prior, on_device(scale, view.points.dtype))
         if float(found.support) >= LEAST_SUPPORT:
             best, factor = found, scale
             if float(found.spread) <= SLAB:
@@ -294,13 +293,13 @@ def _deviation(
 
 def _rectangle(inliers: np.ndarray, normal: np.ndarray, offset: float) -> Plane:
     """The plane with the rectangle that holds its inliers, a hundredth left out at each side."""
-    across = np.asarray(tangents(jnp.asarray(normal)))
+    across = np.asarray(tangents(normal))
     middle = inliers.mean(axis=0) if len(inliers) else offset * normal
     point = middle - (middle @ normal - offset) * normal
     flat = (inliers - point) @ across.T if len(inliers) else np.zeros((1, 2))
     (low_a, low_b), (high_a, high_b) = np.quantile(flat, [0.01, 0.99], axis=0)
     corners = np.array([[low_a, low_b], [high_a, low_b], [high_a, high_b], [low_a, high_b]]) @ across + point
-    return Plane(jnp.asarray(point), jnp.asarray(normal), jnp.asarray(corners.astype(normal.dtype)))
+    return Plane(on_device(point), on_device(normal), on_device(corners.astype(normal.dtype)))
 
 
 def _span(x: np.ndarray, standing: np.ndarray, on: np.ndarray, axis: np.ndarray, eye: np.ndarray | None) -> float:

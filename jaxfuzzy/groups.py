@@ -12,9 +12,9 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import on_device
 from jaxfuzzy.dividing import Parted, cut_in_two, with_left_over
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.joining import parts_of_one_body
@@ -155,8 +155,8 @@ def _rebuilt(
     counts = np.array([len(own) for own, _, _ in groups], float)
     partition = dataclasses.replace(
         parts.partition,
-        centers=jnp.asarray(np.stack(centers), parts.partition.centers.dtype),
-        sizes=jnp.asarray(np.array(size) / np.sum(size), parts.sizes.dtype),
+        centers=on_device(np.stack(centers), parts.partition.centers.dtype),
+        sizes=on_device(np.array(size) / np.sum(size), parts.sizes.dtype),
         memberships=jax.device_put(memberships),
         noise=jax.device_put(noise),
         labels=jax.device_put(labels),
@@ -166,6 +166,6 @@ def _rebuilt(
         labels=partition.labels,
         k=len(groups),
         sizes=partition.sizes,
-        shares=jnp.asarray(counts / counts.sum(), parts.shares.dtype),
+        shares=on_device(counts / counts.sum(), parts.shares.dtype),
         partition=partition,
     )

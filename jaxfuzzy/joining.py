@@ -92,7 +92,7 @@ def _reaches(body: Primitive | None, place: np.ndarray) -> bool:
         offset, axis = place - np.asarray(body.base if isinstance(body, Cylinder) else body.apex), np.asarray(body.axis)
         along = float(offset @ axis)
         if isinstance(body, Cone):
-            radius = max(float(body.height[1]), abs(along)) * float(np.tan(float(body.half_angle)))
+            radius = max(float(np.asarray(body.height)[1]), abs(along)) * float(np.tan(float(body.half_angle)))
         else:
             radius = float(body.radius)
         return float(np.linalg.norm(offset - along * axis)) <= REACHES * radius

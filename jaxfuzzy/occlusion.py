@@ -9,10 +9,9 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.arrays import lengths
+from jaxfuzzy.arrays import lengths, on_device
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -85,8 +84,8 @@ def with_hidden_ends(
             body = shape.primitive
             if isinstance(body, Box):
                 seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
-                body = dataclasses.replace(body, seen=jnp.asarray(seen))
-            status = jnp.asarray(int(shape.status) | Status.LOWER_BOUND, jnp.int32)
+                body = dataclasses.replace(body, seen=on_device(seen))
+            status = on_device(int(shape.status) | Status.LOWER_BOUND, np.int32)
             shape = dataclasses.replace(shape, primitive=body, status=status)
         told.append(shape)
     return tuple(told)

@@ -8,7 +8,6 @@ whose viewing ray passes the surface within its ends has a say; what was not mat
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy.arrays import lengths
@@ -191,7 +190,7 @@ def _hits_of_plane(body: Plane, held: np.ndarray, rays: np.ndarray, camera: np.n
     with np.errstate(divide="ignore"):
         hit = ((np.asarray(body.point, float) - camera) @ normal) / (rays @ normal)
     turns = np.arange(DIRECTIONS)[:, None] * np.pi / DIRECTIONS
-    first, second = np.asarray(tangents(jnp.asarray(normal)), float)
+    first, second = np.asarray(tangents(normal), float)
     across = np.cos(turns) * first + np.sin(turns) * second
     low, high = np.quantile(held @ across.T, ENDS, axis=0)
     place = np.where(hit > 0, hit, 0)[:, None] * (rays @ across.T)
@@ -213,7 +212,8 @@ def _extended(body: Primitive) -> bool:
         case Cylinder():
             return float(body.height) > 0
         case Cone():
-            return float(body.height[0]) < float(body.height[1])
+            low, high = np.asarray(body.height)
+            return bool(low < high)
         case Box():
             return float(np.min(np.asarray(body.size))) > 0
     return True

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfuzzy.arrays import Array, Bool, Float, Int, lengths, record
+from jaxfuzzy.arrays import Array, Bool, Float, Int, lengths, on_device, record
 from jaxfuzzy.linalg import normalised, tangents
 
 # Patches along each side of the view. 24 leaves a patch of a 450 x 375 image some 19 x 16 pixels: over that, a standing
@@ -264,16 +264,17 @@ def view_of(
     low, high = np.quantile(seen[w > 0], [0.002, 0.998], axis=0)
     cell = np.clip((seen - low) / np.maximum(high - low, np.finfo(x.dtype).tiny) * GRID, 0, GRID - 1).astype(np.int32)
 
-    def padded(values: np.ndarray) -> Array:
-        return jnp.asarray(np.concatenate([values, np.zeros((capacity - len(x), *values.shape[1:]), values.dtype)]))
+    def padded(values: np.ndarray, filler: float = 0.0) -> Array:
+        spare = np.full((capacity - len(x), *values.shape[1:]), filler, values.dtype)
+        return on_device(np.concatenate([values, spare]))
 
     # Padding stands at the first point with weight 0, so that nothing is larger or smaller for it.
-    filler = np.concatenate([x, np.broadcast_to(x[:1], (capacity - len(x), 3))])
+    points = np.concatenate([x, np.broadcast_to(x[:1], (capacity - len(x), 3))])
     return View(
-        jnp.asarray(filler),
+        on_device(points),
         padded(w),
         padded(ray),
-        jnp.maximum(padded(floor), 1e-12),
+        padded(np.maximum(floor, 1e-12), 1e-12),
         padded(cell[:, 0] * GRID + cell[:, 1]),
     )
 
@@ -281,10 +282,10 @@ def view_of(
 def seen_at(x: np.ndarray, axis: np.ndarray, eye: np.ndarray | None, of: np.ndarray) -> np.ndarray:
     """Where each point is seen (N, 2): in the image of a camera that looks at the middle of some points, or from above."""
     if eye is None:
-        return x @ np.asarray(tangents(jnp.asarray(axis))).T
+        return x @ np.asarray(tangents(axis)).T
     ahead = (x[of] - eye).mean(axis=0)
     ahead = ahead / np.linalg.norm(ahead)
-    side = np.cross(ahead, axis) if abs(ahead @ axis) < 0.99 else np.asarray(tangents(jnp.asarray(ahead)))[0]
+    side = np.cross(ahead, axis) if abs(ahead @ axis) < 0.99 else np.asarray(tangents(ahead))[0]
     side = side / np.linalg.norm(side)
     depth = np.maximum((x - eye) @ ahead, 1e-6 * np.abs(x - eye).max())
     return (x - eye) @ np.stack([side, np.cross(ahead, side)], axis=1) / depth[:, None]
@@ -314,14 +315,14 @@ def prior_of(
     cosine = near - (index + 0.5) / starts * (near - far)
     turn = np.pi * (3 - np.sqrt(5)) * index
     sine = np.sqrt(1 - cosine**2)
-    across = np.asarray(tangents(jnp.asarray(axis)))
+    across = np.asarray(tangents(axis))
     directions = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=1) @ np.vstack([across, axis])
     return Prior(
-        jnp.asarray(directions, dtype),
-        jnp.asarray(axis, dtype),
-        jnp.asarray(angle, dtype),
-        jnp.asarray(anywhere),
-        jnp.zeros(4, dtype) if eye is None else jnp.asarray([*eye, 1.0], dtype),
+        on_device(directions, dtype),
+        on_device(axis, dtype),
+        on_device(angle, dtype),
+        on_device(anywhere),
+        on_device(np.zeros(4) if eye is None else [*eye, 1.0], dtype),
     )
 
 

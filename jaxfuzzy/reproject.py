@@ -7,11 +7,10 @@ camera's frame. The standard deviation of z follows from that of the disparity, 
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, as_float
+from jaxfuzzy.arrays import Array, as_float, on_device
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.rig import Rig
@@ -174,7 +173,7 @@ def _colors(image: Any, valid: np.ndarray) -> Array:
         raise ValueError(f"image must be uint8 of shape {shape} or {(*shape, 3)}, got {image.dtype} {image.shape}")
     colors = image[valid]
     colors = np.repeat(colors[:, None], 3, axis=1) if colors.ndim == 1 else colors[:, ::-1]
-    return jnp.asarray(colors.astype(np.float32) / 255)
+    return on_device(colors.astype(np.float32) / 255)
 
 
 def _map(value: np.ndarray, name: str, rig: Rig) -> np.ndarray:

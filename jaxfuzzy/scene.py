@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, Float, Int, lengths, record, static
+from jaxfuzzy.arrays import Array, Float, Int, lengths, on_device, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
 from jaxfuzzy.ground import fit_ground, foreground
@@ -281,7 +280,7 @@ def _model(
         least = FEWEST_PIXELS if correlated else FEWEST
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
-            across = np.asarray(tangents(jnp.asarray(vertical)))
+            across = np.asarray(tangents(vertical))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, parted, eye, least)
             members = members_of(parts)
         if correlated:
@@ -310,13 +309,13 @@ def _model(
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,
-        up=jnp.asarray(vertical, points.dtype),
+        up=on_device(vertical, points.dtype),
         ground=plane,
         segmentation=_of_all(parts, own, count),
         shapes=shapes,
         timings=clock.seconds,
         settings={name: _plain(value) for name, value in (settings | options).items()},
-        status=jnp.asarray(status | int(parts.status), jnp.int32),
+        status=on_device(status | int(parts.status), np.int32),
     )
 
 
@@ -370,7 +369,7 @@ def _plain(value: Any) -> Any:
 
 
 def _as_rgb(image: np.ndarray) -> Array:
-    return jnp.asarray(image[..., ::-1] if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2))
+    return on_device(image[..., ::-1] if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2))
 
 
 class _Clock:

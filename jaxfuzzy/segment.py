@@ -5,11 +5,10 @@ from functools import partial
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, record
+from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, on_device, record
 from jaxfuzzy.density import DELTA, PROTOTYPES, SWEEPS, part
 from jaxfuzzy.fcm import Partition, fcm
 from jaxfuzzy.linalg import tangents
@@ -97,7 +96,7 @@ def segment(
     given = checks.weights(weights, count)
     checks.choice(rule, "rule", ("robust", "paper"))
     candidates = _candidates(ks, rule, count)
-    axes = np.asarray(tangents(jnp.asarray(checks.direction(up, "up"))))
+    axes = np.asarray(tangents(checks.direction(up, "up")))
     noise = _noise(noise_distance, count)
     if camera is not None:
         checks.position(camera, "camera")
@@ -119,15 +118,15 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
     if not able:
         raise ValueError(f"ks must hold a number of at most {PROTOTYPES[-1]} for rule='robust', got {candidates}")
     length = MOST if able[-1] <= MOST else PROTOTYPES[-1]
-    allowed = jnp.asarray(np.isin(np.arange(1, length + 1), able))
-    box = jnp.asarray(np.quantile(flat[w > 0], [0.01, 0.99], axis=0), x.dtype)
+    allowed = on_device(np.isin(np.arange(1, length + 1), able))
+    box = on_device(np.quantile(flat[w > 0], [0.01, 0.99], axis=0), x.dtype)
     for _ in range(ATTEMPTS):
         places, weight, cell = _places(flat, w, bandwidth)
         groups = part(
-            jnp.asarray(places, x.dtype),
-            jnp.asarray(weight, x.dtype),
+            on_device(places, x.dtype),
+            on_device(weight, x.dtype),
             box,
-            jnp.asarray(bandwidth, x.dtype),
+            on_device(bandwidth, x.dtype),
             allowed,
             int(cell.max()) + 1,
         )
@@ -155,14 +154,14 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
         status |= Status.TOO_FEW_POINTS
     centers, sizes = _sizes(x, w, flat, u, cell)
     partition = Partition(
-        centers=jnp.asarray(centers, x.dtype),
-        sizes=jnp.asarray(sizes, x.dtype),
+        centers=on_device(centers, x.dtype),
+        sizes=on_device(sizes, x.dtype),
         memberships=jax.device_put(u[cell]),
         noise=jax.device_put(lost[cell]),
         labels=jax.device_put(labels[cell]),
         objective=groups.objective,
-        steps=jnp.asarray(SWEEPS),
-        status=jnp.asarray(int(status), jnp.int32),
+        steps=on_device(SWEEPS, np.int32),
+        status=on_device(int(status), np.int32),
         m=2.0,
         noise_distance=DELTA * bandwidth,
     )
@@ -209,7 +208,7 @@ def _paper(x: np.ndarray, w: np.ndarray, flat: np.ndarray, candidates: tuple[int
     status |= Status(int(fit.status))
     labels = np.asarray(fit.labels)
     return Segmentation(
-        fit.labels, k, fit.sizes, _shares(labels, w, k, x.dtype), fit, count, seeds, jnp.asarray(int(status), jnp.int32)
+        fit.labels, k, fit.sizes, _shares(labels, w, k, x.dtype), fit, count, seeds, on_device(int(status), np.int32)
     )
 
 
@@ -270,7 +269,7 @@ def _numbered(keys: np.ndarray) -> np.ndarray:
 
 def _shares(labels: np.ndarray, w: np.ndarray, k: int, dtype: Any) -> Array:
     mass = np.bincount(labels[labels >= 0], w[labels >= 0], minlength=k)
-    return jnp.asarray(mass / max(mass.sum(), np.finfo(dtype).tiny), dtype)
+    return on_device(mass / max(mass.sum(), np.finfo(dtype).tiny), dtype)
 
 
 def _candidates(ks: Any, rule: str, count: int) -> tuple[int, ...]:

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, record, static
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, on_device, record, static
 from jaxfuzzy.assembly import Bounded, bounded
 from jaxfuzzy.fitting import TOLERANCES, Fitted
 from jaxfuzzy.looks import Look, Settings, first_looks, further_looks, look_about, look_as, side_by_side, unfit
@@ -313,7 +312,7 @@ def with_quadrics(
         if shape.primitive is None and int(shape.status) & NO_QUADRIC == Status.REFUSED:
             found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
         if found is not None:
-            quadric = jax.tree.map(lambda a: jnp.asarray(a, points.dtype), found[0])
+            quadric = jax.tree.map(lambda a: on_device(a, points.dtype), found[0])
             shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jax.device_put(found[1]))
         told.append(shape)
     return tuple(told)
@@ -326,8 +325,8 @@ def refused(shape: Shape, status: Status, why: str) -> Shape:
         kind="unknown",
         primitive=None,
         inliers=jax.device_put(np.zeros(len(shape.inliers), bool)),
-        covariance=jnp.zeros((0, 0), shape.covariance.dtype),
-        status=jnp.asarray(Status.REFUSED | status, jnp.int32),
+        covariance=on_device(np.zeros((0, 0)), shape.covariance.dtype),
+        status=on_device(Status.REFUSED | status, np.int32),
         guards=(*shape.guards, f"{shape.kind}: {why}"),
     )
 
@@ -352,13 +351,13 @@ def _by_most_points(
         status |= Status.MAY_BE_BOX
     return Shape(
         primitive=jax.device_put(found.primitive),
-        inliers=jnp.asarray(found.inliers),
-        noise_distance=jnp.asarray(np.median(delta), settings.dtype),
+        inliers=on_device(found.inliers),
+        noise_distance=on_device(np.median(delta), settings.dtype),
         scores=scores,
         margin=margin,
         counts=found.counts,
-        covariance=jnp.zeros((0, 0), settings.dtype),
-        status=jnp.asarray(int(status), jnp.int32),
+        covariance=on_device(np.zeros((0, 0)), settings.dtype),
+        status=on_device(int(status), np.int32),
         kind=found.kind,
         guards=guards,
     )

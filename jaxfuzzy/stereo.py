@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy.arrays import Array, Bool, Float
+from jaxfuzzy.arrays import Array, Bool, Float, on_device
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.matcher import STEP, Matcher
@@ -62,7 +61,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
             " cameras look inwards, give Matcher(min_disparity=...)"
         )
     disparity_px, valid = disparity(left, right, rig, matcher=matcher)
-    count = int(valid.sum())
+    count = int(np.asarray(valid).sum())
     if count < FEWEST_POINTS:
         rows = f"rows differ by {found.rows_px:+.1f} px" if found.matches else "no common features were found"
         raise DataError(
@@ -109,7 +108,7 @@ def disparity(
         valid = _without_speckles(values, valid, matcher.speckle_px)
     if matcher.refine and valid.any():
         values = _refined(left, right, values, valid)
-    return jnp.asarray(np.where(valid, values, np.float32(np.nan))), jnp.asarray(valid)
+    return on_device(np.where(valid, values, np.float32(np.nan))), on_device(valid)
 
 
 def search_range(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int, int]:

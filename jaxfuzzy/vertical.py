@@ -13,9 +13,9 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxfuzzy.arrays import on_device
 from jaxfuzzy.ground import Ground
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.objects import PIXELS_PER_POINT
@@ -164,13 +164,13 @@ def upright_again(
                 primitive=found.primitive,
                 inliers=found.inliers,
                 covariance=found.covariance,
-                status=jnp.asarray(status, jnp.int32),
+                status=on_device(status, np.int32),
             )
     return tuple(new)
 
 
 def _tangents(up: np.ndarray) -> np.ndarray:
-    return np.asarray(tangents(jnp.asarray(up)), float)
+    return np.asarray(tangents(up), float)
 
 
 def _well_fitted(shape: Shape) -> bool:
