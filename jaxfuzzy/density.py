@@ -122,14 +122,22 @@ def _tile(
 ) -> tuple[Float[Array, "C 2"], Float[Array, ""]]:
     """Noise clustering from seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2). The clusters and their objective."""
     delta = DELTA * bandwidth
+    blocks = _blocks(places, BLOCK), _blocks(weights, BLOCK, fill=True)
 
     def update(prototypes: Array, _: None) -> tuple[Array, Array]:
-        inverse = jnp.where(real, 1 / _squared_distances(places, prototypes, delta), 0)
-        total = inverse.sum(axis=1, keepdims=True) + delta**-2
-        pull = weights[:, None] * (inverse / total) ** 2
-        mass = pull.sum(axis=0)[:, None]
-        moved = (pull.T @ places) / jnp.maximum(mass, jnp.finfo(places.dtype).tiny)
-        return jnp.where(real[:, None] & (mass > 0), moved, prototypes), weights @ (1 / total[:, 0])
+        def add(sums: tuple[Array, Array], block: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+            place, weight = block
+            inverse = jnp.where(real, 1 / _squared_distances(place, prototypes, delta), 0)
+            total = inverse.sum(axis=1, keepdims=True) + delta**-2
+            pull = weight[:, None] * (inverse / total) ** 2
+            moments = pull.T @ jnp.concatenate([place, jnp.ones_like(place[:, :1])], axis=1)
+            return (sums[0] + moments, sums[1] + weight @ (1 / total[:, 0])), None
+
+        start = jnp.zeros((len(prototypes), 3), places.dtype), jnp.zeros((), places.dtype)
+        (moments, objective), _ = lax.scan(add, start, blocks)
+        mass = moments[:, 2:]
+        moved = moments[:, :2] / jnp.maximum(mass, jnp.finfo(places.dtype).tiny)
+        return jnp.where(real[:, None] & (mass > 0), moved, prototypes), objective
 
     prototypes, objectives = lax.scan(update, seeds, length=SWEEPS)
     return prototypes, objectives[-1]
@@ -245,16 +253,20 @@ def _mountains(
 ) -> tuple[Array, Array]:
     """Seeds by the mountain method (Yager and Filev 1994): the place of most support, all near it struck out, and so on."""
 
-    def pick(index: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        left, seeds, real = state
+    def pick(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        index, left, seeds, real = state
         best = jnp.argmax(left)
-        good = (left[best] > least) | (index == 0)
         near = ((places - places[best]) ** 2).sum(axis=1) < (APART * bandwidth) ** 2
-        return jnp.where(near, -1.0, left), seeds.at[index].set(places[best]), real.at[index].set(good)
+        left = jnp.where(near, -1.0, left)
+        return index + 1, left, seeds.at[index].set(places[best]), real.at[index].set(True)
+
+    def more(state: tuple[Array, Array, Array, Array]) -> Array:
+        # The first is one however little it holds.
+        index, left, *_ = state
+        return (index < most) & ((left.max() > least) | (index == 0))
 
     start = jnp.where(weights > 0, held, -1), jnp.zeros((most, 2), places.dtype), jnp.zeros(most, bool)
-    _, seeds, real = lax.fori_loop(0, most, pick, start)
-    return seeds, real
+    return lax.while_loop(more, pick, (jnp.zeros((), int), *start))[2:]
 
 
 def _squared_distances(places: Array, prototypes: Array, scale: Array) -> Array:
