@@ -18,6 +18,8 @@ Fit = Callable[..., tuple[Shape, ...]]
 INSIDE, SURFACE, SLACK = 0.7, 0.4, 2.0
 # So many of its points, and less than twice as many, say whether it does.
 ASKED = 2048
+# What is inside has no more points than so many times the body's own: a ball may be bent through a flat thing, and hold a heap.
+MOST_INSIDE = 3.0
 # A part with fewer points is no object.
 FEWEST = 60
 # What is only tried is fitted to a fair share of its points: so many, and less than twice as many.
@@ -37,8 +39,9 @@ def contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequenc
         slack = SLACK * float(shapes[a].noise_distance)
         inside = [len(own) > 0 and _inside(shapes[a].primitive, own, slack).mean() >= INSIDE for own in some]
         for b in range(len(members)):
+            small = len(members[b]) <= MOST_INSIDE * len(members[a])
             # A group that holds others is no part itself.
-            if inside[a] and inside[b] and b != a and b not in into and b not in into.values():
+            if small and inside[a] and inside[b] and b != a and b not in into and b not in into.values():
                 into[b] = a
     return into
 

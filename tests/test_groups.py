@@ -13,6 +13,7 @@ from jaxfuzzy.joining import _seen_from, _way_hidden, parts_of_one_body
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
 from jaxfuzzy.segment import segment
 from jaxfuzzy.status import Status
+from jaxfuzzy.trials import contained
 from synthetic import fitted_shape
 
 ACROSS = np.array([[1.0, 0, 0], [0, 0, 1.0]])
@@ -183,6 +184,18 @@ def test_a_vessel_in_one_group_is_not_divided():
         points, ACROSS, parts, fit([np.flatnonzero(np.asarray(parts.labels) == 0)]), fit, by_places(points)
     )
     assert same is parts
+
+
+@pytest.mark.parametrize(("count", "holds"), [(500, True), (4000, False)])
+def test_a_body_holds_what_is_inside_but_no_heap_many_times_its_size(count, holds):
+    """The front of a ball, and points within it: its inner wall, or a heap that a ball bent through a flat thing reaches round."""
+    outside = ball([0, 0, 1.0], 0.1, 600)
+    outside = outside[outside[:, 2] < 1.0]
+    points = np.concatenate([outside, ball([0, 0, 1.0], 0.06, count)])
+    members = [np.arange(len(outside)), np.arange(len(outside), len(points))]
+    good = fitted_shape(Sphere(jnp.array([0, 0, 1.0]), jnp.asarray(0.1)), np.ones(len(outside), bool), 0.004)
+    shapes = [good, fitted_shape(None, np.zeros(count, bool), 0.004)]
+    assert contained(points, members, shapes) == ({1: 0} if holds else {})
 
 
 @pytest.mark.parametrize(
