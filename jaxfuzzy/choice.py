@@ -20,6 +20,8 @@ HALF_LOG_2PI = 0.9189385332046727
 PLANE_BONUS = 20.0
 # Radius in units of an object's spread from which on its surface is flat over the object: an arc of about 45 degrees.
 FLATTEST = 3.0
+# The same of a ball, of which a cap of 75 degrees is to be seen: two flat things at an angle are held by a smaller one.
+FLATTEST_BALL = 2.2
 # Of the inliers of a box, so many must lie on each of its faces.
 LEAST_FACE = 0.035
 # A cone narrows by so much a unit of height at least, and at most.
@@ -146,6 +148,6 @@ def _picture(theta: Array, view: View) -> tuple[Array, Array]:
     return jnp.stack([second, first, first], 1), jnp.stack([y, y, second], 1)
 
 
-def stout(radius: Array) -> Array:
+def stout(radius: Array, flattest: float = FLATTEST) -> Array:
     """A radius must be neither nothing nor so large that the surface is flat over the object."""
-    return (radius > 0.01) & (radius < FLATTEST)
+    return (radius > 0.01) & (radius < flattest)

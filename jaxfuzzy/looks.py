@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy import fitting
-from jaxfuzzy.choice import FLATTEST, SLOPES
+from jaxfuzzy.choice import FLATTEST, FLATTEST_BALL, SLOPES
 from jaxfuzzy.fitting import Fitted
 from jaxfuzzy.objects import DEVIATIONS, PIXELS_PER_POINT, Prepared, about, padded, prepared, with_more
 from jaxfuzzy.search import KINDS, MORE
@@ -255,7 +255,7 @@ def _worn(fitted: Fitted) -> bool:
     """Whether the last polish took all narrowing from a cone, or the bend from what is round."""
     kind, theta = KINDS[fitted.kind], fitted.polished.theta
     straight = kind == "cone" and not SLOPES[0] < abs(theta[3])
-    flat = kind in ROUND and not theta[3 if kind == "sphere" else 2] < FLATTEST
+    flat = kind in ROUND and not (theta[3] < FLATTEST_BALL if kind == "sphere" else theta[2] < FLATTEST)
     return bool(fitted.passed.any()) and (straight or flat)
 
 

@@ -127,7 +127,7 @@ def _choose(
                 turned(more, turns[boxes]),
             ),
             choice.stout(fine.theta[bodies, 2]) & (tapers | ~steep),
-            choice.stout(fine.theta[spheres, 3]),
+            choice.stout(fine.theta[spheres, 3], choice.FLATTEST_BALL),
         ]
     )
     zeros = lambda n: jnp.zeros(n, int)
