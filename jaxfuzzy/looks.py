@@ -34,10 +34,11 @@ MISFIT_GIVEN = 1.75
 # tables (a bowl of which every third row is looked at 2.1), on simulated clouds 1.1; a plaster bust has 2.3 to 3.4 by five
 # matchers, bowling pins 3.3 to 5.1, boxes fitted to round things 2.9 to 4.8. Flat things may be bent a little (the second).
 ABOVE, ABOVE_FLAT, WAVY = 0.8, 1.15, 2.2
-# And it is refused where the mean residuals of patches, of as many pixels as tell as much as one independent point, are so many
-# deviations (in the median; flat things may be bent a little), though small windows scatter no more than they should: the surface
-# bends in other ways than its kind does. On photographs right ones have up to 0.77, a carved mask 1.5, a bust 1.4, pins 1.9.
-# Patches of fewer points are none, and fewer patches say nothing.
+# A surface of pixels is refused where the mean residuals of patches, of as many pixels as tell as much as one independent
+# point, are so many deviations (in the median; flat things may be bent a little), though small windows scatter no more than
+# they should: the surface bends in other ways than its kind does. On photographs right ones have up to 0.71, a carved mask
+# 1.5, a bust 1.4, pins 1.9. Patches of fewer points are none, and fewer patches say nothing. Depth cameras are so exact that
+# real boxes bulge by more.
 WAVES, WAVES_FLAT, FEWEST_IN_PATCH, FEWEST_PATCHES = 1.1, 1.6, 16, 9
 NORMAL_MEDIAN = 0.6745
 # Just off a surface: up to so many deviations.
@@ -68,7 +69,17 @@ R = TypeVar("R")
 
 
 class Settings(NamedTuple):
-    """What is the same for all objects of a call."""
+    """What is the same for all objects of a call.
+
+    Attributes:
+        kinds: Kinds to choose from.
+        gric: Whether to score by GRIC.
+        along_ray: Whether residuals are along the viewing ray.
+        camera: Where the points were seen from.
+        dtype: Their type.
+        capacity: Points that an object is fitted to at most.
+        correlated: Whether the points are pixels, of which neighbors err alike.
+    """
 
     kinds: tuple[str, ...]
     gric: bool
@@ -76,6 +87,7 @@ class Settings(NamedTuple):
     camera: np.ndarray | None
     dtype: Any
     capacity: int
+    correlated: bool = False
 
 
 class Look(NamedTuple):
@@ -88,6 +100,7 @@ class Look(NamedTuple):
         reason: Why it is refused; 0 where it is not.
         other: Another look, about another vertical, that found better candidates of some kinds.
         theirs: Of which (5,).
+        correlated: Whether its points are pixels, of which neighbors err alike.
     """
 
     item: Prepared
@@ -96,6 +109,7 @@ class Look(NamedTuple):
     reason: Status
     other: "Look | None" = None
     theirs: np.ndarray | None = None
+    correlated: bool = False
 
     @property
     def fitted_to(self) -> int:
@@ -246,7 +260,7 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
             fitted = fitted._replace(kind=kind, passed=passed)
             if passed.any():
                 fitted = fitted._replace(polished=fitting.finished(small, fitted.found, kind, settings.along_ray))
-        return _judged(Look(item, fitted, noise, Status(0)))
+        return _judged(Look(item, fitted, noise, Status(0), correlated=settings.correlated))
 
     return side_by_side(search, range(len(items)))
 
@@ -272,7 +286,9 @@ def _reason(look: Look) -> Status:
     times = float(p.scale) / max(1.0, float(look.fitted.local))
     least = ABOVE_FLAT if KINDS[look.fitted.kind] == "plane" else ABOVE
     wavy = p.scale > max(least, WAVY * float(look.fitted.local))
-    if item.given and (times > MISFIT_GIVEN or wavy or _beyond(look) > BEYOND or _waves(look) > 1):
+    if item.given and (
+        times > MISFIT_GIVEN or wavy or _beyond(look) > BEYOND or (look.correlated and _waves(look) > 1)
+    ):
         return Status.REFUSED | look.scattered
     near = weight @ ((distance > DEVIATIONS) & (distance < FAR)) / (weight @ (distance < FAR))
     suspect = look.misfit > SUSPECT and near > NEAR and look.noise > BULGE

@@ -250,8 +250,9 @@ def _model(
             loose[own[np.concatenate([np.zeros(0, int), *members])]] = False
             sight = sight_of(points, loose, eye, np.asarray(vertical, float))
 
-        fits = Fits(places, **seen(own) | picked | {"rule": shape_rule, "capacity": OF_SCENE})
         correlated = cloud.pixels_px is not None and shape_rule != "paper"
+        how = picked | {"rule": shape_rule, "capacity": OF_SCENE, "correlated": correlated}
+        fits = Fits(places, **seen(own) | how)
 
         def fit(
             sets: Sequence[np.ndarray],

@@ -175,6 +175,7 @@ class Fits:
         noise_distance, kinds, up, camera, distance, rule, weights: As in `fit_shape`.
         capacity: Points that a set is fitted to at most; 0 to choose by the first sets. Larger sets are fitted to a fair sample,
             and all their points judged.
+        correlated: Whether the points are pixels, of which neighbors err alike.
     """
 
     def __init__(
@@ -189,6 +190,7 @@ class Fits:
         rule: Literal["likelihood", "gric", "paper"] = "likelihood",
         weights: ArrayLike | None = None,
         capacity: int = 0,
+        correlated: bool = False,
     ) -> None:
         self.points = checks.places(points)
         count = len(self.points)
@@ -206,9 +208,8 @@ class Fits:
         weight = checks.weights(weights, count)
         self.weight = np.ones(count) if weight is None else np.asarray(weight, float)
         along_ray = self.distance == "ray" or (rule == "paper" and eye is not None)
-        self.settings = Settings(
-            kinds, rule == "gric", along_ray, eye, self.points.dtype, capacity and capacity_for(capacity)
-        )
+        most = capacity and capacity_for(capacity)
+        self.settings = Settings(kinds, rule == "gric", along_ray, eye, self.points.dtype, most, correlated)
         self._first: dict[bytes, Look | Status] = {}
         self._further: dict[bytes, Look] = {}
 

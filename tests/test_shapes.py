@@ -178,12 +178,14 @@ def test_a_surface_that_patches_lie_off_is_refused(monkeypatch):
     # A product of two sines deviates by half its amplitude.
     wavy = points * (1 + 2.6 * 0.003 * wave / np.linalg.norm(points, axis=1))[:, None]
 
-    def named(cloud):
+    def named(cloud, pixels=True):
         noise = SIGMAS * 0.003 * (cloud**2).sum(axis=1)
-        return Fits(cloud, camera=CAMERA, noise_distance=noise, capacity=2048).shapes([np.arange(len(cloud))])[0].kind
+        fits = Fits(cloud, camera=CAMERA, noise_distance=noise, capacity=2048, correlated=pixels)
+        return fits.shapes([np.arange(len(cloud))])[0].kind
 
     assert named(points) == "cylinder"
     assert named(wavy) == "unknown"
+    assert named(wavy, pixels=False) == "cylinder"
     monkeypatch.setattr(looks, "WAVES", np.inf)
     assert named(wavy) == "cylinder"
 
