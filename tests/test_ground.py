@@ -1,12 +1,13 @@
 """The supporting plane, the upright frame and the foreground, on scenes cast ray by ray and on real ones."""
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.ground import find_ground, fit_ground, foreground, upright
-from jaxfuzzy.planes import GRID, _within
+from jaxfuzzy.planes import GRID, PAIRS, _Patches, _smallest_directions, _weighted_median, _within
 from jaxfuzzy.rig import load_rig
 from jaxfuzzy.simulate import simulate_scene
 from jaxfuzzy.status import Status
@@ -325,3 +326,36 @@ def test_a_plane_through_three_points_is_no_ground_and_an_exact_one_has_a_noise(
     exact = fit_ground(np.stack([a, np.full_like(a, 0.5), b], -1).reshape(-1, 3))
     assert exact.plane is not None
     assert (np.asarray(exact.depth_std) > 0).all()
+
+
+def test_planes_through_patches_are_those_of_eigenvectors():
+    """Two sets of weights: patches along a thin plane, and patches of which no direction is much the smallest."""
+    rng = np.random.default_rng(0)
+    mean = rng.normal(size=(50, 3)) * [1.0, 0.7, 0.6]
+    mean[:25, 2] *= 0.01
+    spread = rng.normal(size=(50, 3, 3)) * 0.05
+    scatter = spread @ spread.transpose(0, 2, 1)
+    weights = np.stack([np.arange(50) < 25, np.arange(50) >= 25]) * rng.uniform(0.5, 1, (2, 50))
+    toward = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    patches = _Patches(*map(jnp.asarray, (mean, scatter[:, PAIRS[0], PAIRS[1]], np.ones(50), mean, np.ones(50))))
+    normals, offsets = _smallest_directions(jnp.asarray(weights), patches, jnp.asarray(toward))
+    for weight, normal, offset, side in zip(weights, normals, offsets, toward, strict=True):
+        share = weight / weight.sum()
+        center = share @ mean
+        moments = ((mean - center) * share[:, None]).T @ (mean - center) + np.einsum("p,pij->ij", share, scatter)
+        values, vectors = np.linalg.eigh(moments)
+        expected = vectors[:, 0] * np.sign(vectors[:, 0] @ side)
+        # Nine squarings leave the ratio of the two smallest eigenvalues to the power 512; moments lose half their digits at most.
+        assert (values[0] / values[1]) ** 512 < 1e-12
+        np.testing.assert_allclose(normal, expected, atol=1e-8)
+        np.testing.assert_allclose(offset, expected @ center, atol=1e-8)
+
+
+def test_weighted_median_halves_the_weight():
+    rng = np.random.default_rng(1)
+    values, weights = rng.exponential(size=501), rng.uniform(0, 1, 501)
+    weights[::4] = 0
+    order = np.argsort(values)
+    expected = values[order][np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]
+    np.testing.assert_allclose(_weighted_median(jnp.asarray(values), jnp.asarray(weights)), expected, rtol=1e-12)
+    assert float(_weighted_median(jnp.zeros(5), jnp.ones(5))) == 0
