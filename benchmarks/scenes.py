@@ -63,6 +63,19 @@ PLACES = (
     ("adirondack", "mug", 364, 155, ("cylinder",)),
     ("adirondack", "book at the left", 118, 254, ("box", "plane")),
 )
+# Settings of the matcher that the cones are looked at by.
+SETTINGS: tuple[dict[str, Any], ...] = (
+    {},
+    {"smoothness": (3.0, 32.0)},
+    {"smoothness": (8.0, 32.0)},
+    {"block": 5},
+    {"smoothness": (8.0, 32.0), "block": 5},
+    {"method": "hh"},
+    {"left_right_px": None},
+    {"edge_px": 2},
+    {"uniqueness": 5},
+    {"refine": False},
+)
 BALL_RADIUS_MM = 203.7  # of a sphere fitted to the true disparities; lengths of this pair are nominal
 NEAR_PX = 6
 
@@ -205,7 +218,27 @@ def duration(data: Path) -> dict[str, Any]:
     return result
 
 
-PARTS = {"rendered": rendered, "photographs": photographs, "duration": duration}
+def settings(data: Path) -> dict[str, Any]:
+    """What the cones are taken for by other settings of the matcher: how many of their places are named rightly."""
+    folder, left, right = PHOTOGRAPHS["cones"]
+    rig = rig_of(data, folder)
+    places = [place[1:] for place in PLACES if place[0] == "cones"]
+    rows = []
+    for options in SETTINGS:
+        scene = jf.model_scene(data / folder / left, data / folder / right, rig, matcher=jf.Matcher(**options))
+        wrong = []
+        for seen, column, row, kinds in places:
+            owner = owner_at(scene, column, row)
+            kind = "nothing" if owner is None else scene.shapes[owner].kind
+            wrong += [] if kind in kinds else [f"{seen} as {kind}"]
+        cones = sum(shape.kind == "cone" for shape in scene.shapes)
+        told = ", ".join(f"{name}={value}" for name, value in options.items()) or "default"
+        rows.append((told, len(places) - len(wrong), cones, ", ".join(wrong) or "none"))
+    table(f"Cones by other settings, {len(places)} places", ("matcher", "right", "cones named", "wrong"), rows)
+    return {"rows": rows}
+
+
+PARTS = {"rendered": rendered, "photographs": photographs, "settings": settings, "duration": duration}
 
 
 def main() -> None:
