@@ -73,8 +73,13 @@ def fit(item: dict[str, np.ndarray], allowed: np.ndarray, gric: bool, along_ray:
     """
     found = jax.device_get(_search(item, np.asarray(gric), along_ray))
     passed = found.passed & allowed
-    kind = int(np.argmin(np.where(passed, found.scores, np.inf)))
+    kind = best_kind(found.scores, passed)
     return Fitted(kind, found.scores, passed, found, finished(item, found, kind, along_ray))
+
+
+def best_kind(scores: np.ndarray, passed: np.ndarray) -> int:
+    """The kind of the best score among those that passed (5,)."""
+    return int(np.argmin(np.where(passed, scores, np.inf)))
 
 
 def finished(item: dict[str, np.ndarray], found: search.Found, kind: int, along_ray: bool) -> polish.Polished:

@@ -5,10 +5,11 @@ nothing of kinds, say it is.
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -98,18 +99,14 @@ class Look(NamedTuple):
         fitted: What was found.
         expected: Noise of its points by what was given or by small windows, in its unit.
         reason: Why it is refused; 0 where it is not.
-        other: Another look, about another vertical, that found better candidates of some kinds.
-        theirs: Of which (5,).
-        correlated: Whether its points are pixels, of which neighbors err alike.
+        rivals: Looks about other verticals that found better candidates of some kinds, by the indices of these.
     """
 
     item: Prepared
     fitted: Fitted
     expected: float
     reason: Status
-    other: "Look | None" = None
-    theirs: np.ndarray | None = None
-    correlated: bool = False
+    rivals: Mapping[int, "Look"] = MappingProxyType({})
 
     @property
     def fitted_to(self) -> int:
@@ -179,7 +176,7 @@ def further_looks(looks: Sequence[Look], settings: Settings) -> list[Look]:
     for (i, look, _), new in zip(turned, others, strict=True):
         # Another vertical is one more freedom: what it finds must fit well.
         if not new.reason and new.misfit <= SUSPECT and (looks[i].reason or new.score < looks[i].score):
-            whole = _judged(_knowing(new, looks[i])._replace(item=_whole(new.item, look, settings)))
+            whole = _judged(_knowing(new, looks[i])._replace(item=_whole(new.item, look, settings)), settings)
             looks[i] = looks[i] if whole.reason else whole
     return looks
 
@@ -187,10 +184,10 @@ def further_looks(looks: Sequence[Look], settings: Settings) -> list[Look]:
 def look_as(look: Look, kind: str, settings: Settings) -> Look:
     """The same object as another kind, from the best candidate of it that was found."""
     index = KINDS.index(kind)
-    source = look.other if look.other is not None and look.theirs is not None and look.theirs[index] else look
+    source = look.rivals.get(index, look)
     found, small = source.fitted.found, padded(source.item, settings.capacity, settings.dtype)
     polished = fitting.finished(small, found, index, settings.along_ray)
-    return _judged(source._replace(fitted=look.fitted._replace(kind=index, found=found, polished=polished)))
+    return _judged(source._replace(fitted=look.fitted._replace(kind=index, found=found, polished=polished)), settings)
 
 
 def look_about(look: Look, up: np.ndarray, lean: float, settings: Settings) -> Look:
@@ -202,11 +199,11 @@ def look_about(look: Look, up: np.ndarray, lean: float, settings: Settings) -> L
     start = fitting.Start(candidate, polished.turn @ step.T, polished.scale, polished.background)
     small = padded(item, settings.capacity, settings.dtype)
     again = fitting.polished_from(small, start, fitted.kind, fitted.deviation, settings.along_ray)
-    return _judged(look._replace(item=item, fitted=fitted._replace(polished=again)))
+    return _judged(look._replace(item=item, fitted=fitted._replace(polished=again)), settings)
 
 
-def _judged(look: Look) -> Look:
-    return look._replace(reason=_reason(look))
+def _judged(look: Look, settings: Settings) -> Look:
+    return look._replace(reason=_reason(look, settings.correlated))
 
 
 @contextmanager
@@ -256,11 +253,11 @@ def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[fl
         # What the last polish took out of shape is of another kind.
         while _worn(fitted):
             passed = fitted.passed & (np.arange(len(KINDS)) != fitted.kind)
-            kind = int(np.argmin(np.where(passed, fitted.scores, np.inf)))
+            kind = fitting.best_kind(fitted.scores, passed)
             fitted = fitted._replace(kind=kind, passed=passed)
             if passed.any():
                 fitted = fitted._replace(polished=fitting.finished(small, fitted.found, kind, settings.along_ray))
-        return _judged(Look(item, fitted, noise, Status(0), correlated=settings.correlated))
+        return _judged(Look(item, fitted, noise, Status(0)), settings)
 
     return side_by_side(search, range(len(items)))
 
@@ -273,7 +270,7 @@ def _worn(fitted: Fitted) -> bool:
     return bool(fitted.passed.any()) and (straight or flat)
 
 
-def _reason(look: Look) -> Status:
+def _reason(look: Look, correlated: bool) -> Status:
     """Why the best surface is refused; 0 where it is not."""
     item, p = look.item, look.fitted.polished
     if not look.fitted.passed.any() or not np.isfinite(p.theta).all() or _worn(look.fitted):
@@ -286,9 +283,7 @@ def _reason(look: Look) -> Status:
     times = float(p.scale) / max(1.0, float(look.fitted.local))
     least = ABOVE_FLAT if KINDS[look.fitted.kind] == "plane" else ABOVE
     wavy = p.scale > max(least, WAVY * float(look.fitted.local))
-    if item.given and (
-        times > MISFIT_GIVEN or wavy or _beyond(look) > BEYOND or (look.correlated and _waves(look) > 1)
-    ):
+    if item.given and (times > MISFIT_GIVEN or wavy or _beyond(look) > BEYOND or (correlated and _waves(look) > 1)):
         return Status.REFUSED | look.scattered
     near = weight @ ((distance > DEVIATIONS) & (distance < FAR)) / (weight @ (distance < FAR))
     suspect = look.misfit > SUSPECT and near > NEAR and look.noise > BULGE
@@ -370,7 +365,9 @@ def _knowing(new: Look, other: Look) -> Look:
     better = (theirs < new.fitted.scores) & (np.arange(len(KINDS)) != new.fitted.kind)
     pick: Any = lambda of, own: np.where(better, of, own)
     scores, passed = pick(theirs, new.fitted.scores), pick(other.fitted.passed, new.fitted.passed)
-    return new._replace(fitted=new.fitted._replace(scores=scores, passed=passed), other=other, theirs=better)
+    # What that one knew from others is theirs.
+    rivals = {int(i): other.rivals.get(int(i), other) for i in np.flatnonzero(better)}
+    return new._replace(fitted=new.fitted._replace(scores=scores, passed=passed), rivals=rivals)
 
 
 def _whole(new: Prepared, look: Look, settings: Settings) -> Prepared:

@@ -122,13 +122,14 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
     box = on_device(np.quantile(flat[w > 0], [0.01, 0.99], axis=0), x.dtype)
     for _ in range(ATTEMPTS):
         places, weight, cell = _places(flat, w, bandwidth)
+        number = int(cell.max()) + 1
         groups = part(
             on_device(places, x.dtype),
             on_device(weight, x.dtype),
             box,
             on_device(bandwidth, x.dtype),
             allowed,
-            int(cell.max()) + 1,
+            number,
         )
         if groups is not None and int(groups.count) >= able[0]:
             break
@@ -138,7 +139,7 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
         raise checks.DataError(
             "the points are too scattered to be divided: remove outliers, or give a larger noise_distance"
         )
-    k, number = int(groups.count), int(cell.max()) + 1
+    k = int(groups.count)
     shares, typicality = np.asarray(groups.shares)[:number, :k], np.asarray(groups.typicality)[:number]
     # Noise takes as much of a place as its best object does where its support is just enough, and more with less support;
     # and all that belongs to groups that are no objects.

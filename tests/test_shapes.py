@@ -3,6 +3,8 @@
 The search compiles once for double precision with a camera and once for single precision without; every test uses one of the two.
 """
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from jaxfuzzy.status import Status
 
 SIGMAS = 2.5
 CAMERA = np.zeros(3)
+UPWARDS = np.array([0.0, 1.0, 0.0])
 
 
 def together(clouds):
@@ -460,3 +463,20 @@ def test_an_axis_is_square_to_most_normals_though_a_third_are_of_edges():
     # Without two that differ any direction square to the one will do.
     alone = looks._square_to_most(np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
     assert abs(alone[1]) < 1e-12
+
+
+def test_a_look_knows_whose_candidates_the_scores_are_that_it_was_told():
+    """Three looks one after the other, each better at one kind: the last knows the first's through the second."""
+    item = looks.prepared(np.random.default_rng(0).normal(size=(20, 3)), np.ones(20), np.ones(20), UPWARDS, None, False)
+
+    def look(kind, scores):
+        found, polished = SimpleNamespace(deviation=1.0), SimpleNamespace(square=np.zeros(20))
+        fitted = fitting.Fitted(kind, np.array(scores), np.ones(5, bool), found, polished)
+        return looks.Look(item, fitted, 1.0, Status(0))
+
+    first, second, third = look(0, [1.0, 9, 9, 9, 9]), look(1, [9.0, 1, 9, 9, 9]), look(2, [9.0, 9, 1, 9, 9])
+    known = looks._knowing(third, looks._knowing(second, first))
+    np.testing.assert_array_equal(known.fitted.scores, [1, 1, 1, 9, 9])
+    assert known.rivals[0] is first
+    assert known.rivals[1].fitted.polished is second.fitted.polished
+    assert sorted(known.rivals) == [0, 1]
