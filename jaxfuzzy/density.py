@@ -22,7 +22,9 @@ PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
 SWEEPS = 10
 # Bandwidths that the number of groups is looked for at: two ladders of a factor 2 in h², interleaved, over the first one's base.
 LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
-BASE, STEADY = 2, 3
+# Rung of the base. A number of groups is steady when it stays for so many rungs; where the prominence that decides is within
+# this factor of the limit, by its logarithm, a rung counts in part, so that rounding moves no number by a whole rung.
+BASE, STEADY, SOFT = 2, 2.1, 1.16
 # Lengths in bandwidths: distance between seeds, noise distance, farthest neighbour, margin of the box that background is sought in.
 APART, DELTA, REACH, MARGIN = 2.0, 2.4, 7.2, 4.0
 # A seed stands so many standard deviations of a count above the background, which is the median over a lattice.
@@ -45,8 +47,7 @@ class Groups:
     Attributes:
         prototypes: Centers of the small clusters.
         group: Rank of the group that each prototype belongs to, -1 for none.
-        counts: Number of groups that the tests tell apart, at each bandwidth of the ladder.
-        found: The one of these that stays longest.
+        found: Number of groups that stays longest along the ladder of bandwidths.
         count: Number of groups kept.
         shares: Each place's membership in the groups, -1's share left out.
         typicality: Support of each place over the least that its group asks for; below 1 it is an outlier.
@@ -55,7 +56,6 @@ class Groups:
 
     prototypes: Float[Array, "C 2"]
     group: Int[Array, " C"]
-    counts: Int[Array, " L"]
     found: Int[Array, ""]
     count: Int[Array, ""]
     shares: Float[Array, "P G"]
@@ -156,13 +156,12 @@ def _divide(
     orders = jnp.argsort(-saddles, axis=1, stable=True)
     judge = jax.vmap(lambda *level: _prominences(one, other, near, real, *level))
     valleys, prominences = judge(orders, saddles, peaks, backgrounds)
-    counts = jnp.maximum((prominences >= 1).sum(axis=1), 1)
-    level = _steadiest(counts)
+    level, number = _steadiest(prominences)
     peak, order, valley, prominence = peaks[level], orders[level], valleys[level], prominences[level]
 
     # The nearest number that is allowed, the lower of two.
     numbers = jnp.arange(1, len(allowed) + 1)
-    wanted = numbers[jnp.argmin(jnp.where(allowed, jnp.abs(numbers - counts[level]), jnp.inf))]
+    wanted = numbers[jnp.argmin(jnp.where(allowed, jnp.abs(numbers - number), jnp.inf))]
     kept = (_rank(-prominence) < wanted) & real
     root = _join(one[order], other[order], near[order], peak, kept | (valley >= 1))
     # Objects in the order of their peaks, the strongest first.
@@ -176,7 +175,7 @@ def _divide(
     chance = (jnp.sqrt(backgrounds[BASE]) + SPARSE_SIGMAS / 2) ** 2
     least = jnp.minimum(SPARSE * usual[jnp.argmax(shares, axis=1)], chance)
     typicality = survey.held / jnp.maximum(least, jnp.finfo(places.dtype).tiny)
-    return Groups(prototypes, group, counts, counts[level], kept.sum(), shares, typicality, objective)
+    return Groups(prototypes, group, number, kept.sum(), shares, typicality, objective)
 
 
 def _rank(values: Array) -> Array:
@@ -186,24 +185,25 @@ def _rank(values: Array) -> Array:
     return before.sum(axis=1)
 
 
-def _steadiest(counts: Int[Array, " L"]) -> Int[Array, ""]:
-    """Of a ladder of bandwidths, one at which the number of groups is the one that stays longest; near the base.
+def _steadiest(prominences: Float[Array, "L C"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The number of groups that stays longest along a ladder of bandwidths, and a rung at which there are so many.
 
     Where none stays for `STEADY` rungs there is detail at every scale, as in a crowded photograph, and a number that two rungs
-    share is chance: the base is taken.
+    share is chance: the base is taken, and the number there.
     """
-    rungs = jnp.arange(len(counts))
-    same = counts[:, None] == counts
-    # A run from i to j is whole when no rung between differs.
-    between = (rungs >= jnp.minimum(rungs[:, None], rungs)[..., None]) & (
-        rungs <= jnp.maximum(rungs[:, None], rungs)[..., None]
-    )
-    run = jnp.all(same[:, None, :] | ~between, axis=-1)
-    length = run.sum(axis=1)
-    # Of two that stay as long the narrower; within a run the rung nearest to the base.
-    first = jnp.argmax(run, axis=1)
-    longest = jnp.argmin(-length * 10000 + first * 100 + jnp.abs(rungs - BASE))
-    return jnp.where(length.max() >= STEADY, longest, BASE)
+    last = jnp.zeros_like(prominences[:, :1])
+    ranked = jnp.concatenate([-jnp.sort(-prominences, axis=1), last], axis=1)
+    # How far the prominence of each rank stands above the limit: 0 to 1.
+    above = jnp.log(jnp.maximum(ranked, jnp.finfo(ranked.dtype).tiny))
+    stands = jnp.clip(0.5 + 0.5 * above / np.log(SOFT), 0, 1)
+    share = stands[:, :-1] * (1 - stands[:, 1:])
+    life = share.sum(axis=0)
+    # Of two that stay as long the narrower, which is the larger number.
+    most = len(life) - 1 - jnp.argmax(jnp.where(life >= life.max() - 0.25, 1, 0)[::-1])
+    nearness = jnp.round(share[:, most], 1) - 0.01 * jnp.abs(jnp.arange(len(share)) - BASE)
+    steady = life.max() >= STEADY
+    level = jnp.where(steady, jnp.argmax(nearness), BASE)
+    return level, jnp.where(steady, most + 1, jnp.maximum((prominences[BASE] >= 1).sum(), 1))
 
 
 def _supports(

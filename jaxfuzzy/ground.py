@@ -177,8 +177,9 @@ def foreground(
     """The points that stand on the ground, without the ground and without the walls behind.
 
     A point is above the ground when its height is more than three standard deviations of that height. A wall is a plane
-    that stands, leaning by 40 degrees at most, that ends the view (nothing is seen behind it, neither objects nor ground) and that
-    spans two fifths of the view in width or height; a box on the table has table behind it. Walls go, with what is behind them.
+    that stands, leaning by 40 degrees at most, that ends the view (nothing is seen behind it, neither objects nor ground, and it
+    is not seen edge on) and that spans two fifths of the view in width or height; a box on the table has table behind it. Walls
+    go, with what is behind them.
 
     Args:
         points: Points (N, 3) in metres.
@@ -203,7 +204,7 @@ def foreground(
         flat = height <= least
         kept &= ~flat
         cut = on_device(np.median(least), cloud.dtype)
-    prior = prior_of(axis, (np.pi / 2, np.pi / 9, np.pi * 2 / 9), eye, cloud.dtype, anywhere=True)
+    prior = prior_of(axis, (np.pi / 2, np.pi / 9, np.pi * 2 / 9), eye, cloud.dtype, ends_view=True)
     walls: list[Plane] = []
     standing = kept.copy()
     while len(walls) < MOST_WALLS and kept.any():

@@ -29,6 +29,8 @@ OFFSETS, BINS = 4, 48
 PATCH_DELTA, POINT_DELTA = 1.0, 2.5
 # Sideways deviation of a point over the one along its ray: keeps grazing planes from becoming infinitely thin.
 SIDEWAYS = 0.1
+# Cosine between its normal and the ray to its middle below which a plane is seen edge on: it ends no view.
+EDGE_ON = 0.2
 # Coordinates of the products that make a scatter, how often each stands in it, and how often cofactors are squared.
 PAIRS, TWICE = np.triu_indices(3), np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0], np.float32)
 SQUARINGS = 9
@@ -61,14 +63,15 @@ class Prior:
         starts: Directions to start from.
         axis: The direction that the angle refers to.
         angle: Center, standard deviation and largest difference of the angle between normal and axis, in radians.
-        anywhere: Count all that is behind the plane against it, not only what is behind within its outline.
+        ends_view: The plane ends the view: it is not seen edge on, and all that is behind it counts against it, not only what
+            is behind within its outline.
         eye: The camera and 1, or zeros where it is not known.
     """
 
     starts: Float[Array, "S 3"]
     axis: Float[Array, "3"]
     angle: Float[Array, "3"]
-    anywhere: Bool[Array, ""]
+    ends_view: Bool[Array, ""]
     eye: Float[Array, "4"]
 
 
@@ -106,13 +109,15 @@ def fit_plane(view: View, prior: Prior, scale: Float[Array, ""]) -> Candidate:
         above, below = (weight * (residual > 3)).sum(), (weight * (residual < -3)).sum()
         seen_from = (prior.eye[:3] - middle) @ normal - offset
         side = jnp.where(jnp.where(prior.eye[3] > 0, seen_from, above - below) < 0, -1, 1)
-        outline = jnp.where(prior.anywhere, 1, within)
+        away = jnp.linalg.norm(u @ patches.mean / jnp.maximum(u.sum(), 1e-9) - (prior.eye[:3] - middle))
+        edge_on = prior.ends_view & (prior.eye[3] > 0) & (jnp.abs(seen_from) < EDGE_ON * away)
+        outline = jnp.where(prior.ends_view, 1, within)
         hidden = jnp.where(side * residual < -3, weight * outline, 0).sum()
         center, deviation, largest = prior.angle
         angle = jnp.arccos(jnp.clip(jnp.abs(normal @ prior.axis), 0, 1)) - center
         support = (u.sum() - hidden) / weight.sum()
         score = jnp.where(support > 0, support * jnp.exp(-0.5 * (angle / deviation) ** 2), support)
-        return jnp.where(jnp.abs(angle) <= largest, score, -jnp.inf), support, side
+        return jnp.where((jnp.abs(angle) <= largest) & ~edge_on, score, -jnp.inf), support, side
 
     starts = jnp.repeat(prior.starts, OFFSETS, axis=0), _offsets(patches, prior.starts).ravel()
     deltas = PATCH_DELTA * jnp.concatenate([4 * 0.8 ** jnp.arange(6.0), jnp.ones(4)]).astype(middle.dtype)
@@ -298,7 +303,7 @@ def prior_of(
     dtype: Any,
     *,
     starts: int = 96,
-    anywhere: bool = False,
+    ends_view: bool = False,
 ) -> Prior:
     """A prior with its starts spread evenly, on a Fibonacci spiral, over the directions that it allows.
 
@@ -308,7 +313,7 @@ def prior_of(
         eye: The camera, or None.
         dtype: Float type.
         starts: How many directions to start from.
-        anywhere: See `Prior`.
+        ends_view: See `Prior`.
     """
     near, far = np.cos(max(angle[0] - angle[2], 0.0)), np.cos(min(angle[0] + angle[2], np.pi / 2))
     index = np.arange(starts)
@@ -321,7 +326,7 @@ def prior_of(
         on_device(directions, dtype),
         on_device(axis, dtype),
         on_device(angle, dtype),
-        on_device(anywhere),
+        on_device(ends_view),
         on_device(np.zeros(4) if eye is None else [*eye, 1.0], dtype),
     )
 

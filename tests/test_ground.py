@@ -1,5 +1,7 @@
 """The supporting plane, the upright frame and the foreground, on scenes cast ray by ray and on real ones."""
 
+import dataclasses
+
 import cv2
 import jax.numpy as jnp
 import numpy as np
@@ -219,6 +221,26 @@ def test_a_box_on_the_table_is_no_wall():
     front = foreground(points, fit_ground(points, depth_std=std))
     assert front.walls == ()
     assert np.asarray(front.mask)[face].mean() > 0.85
+
+
+def test_what_is_seen_edge_on_ends_no_view():
+    """The side of a shelf, nearly in line with the camera, is no wall, or all to the left of it would be background."""
+    rng = np.random.default_rng(0)
+    depth, height = rng.uniform(0.8, 2.0, 6000), rng.uniform(-0.25, 0.25, 6000)
+    side = np.stack([np.full(6000, -0.06), height * depth, depth], axis=1)
+    side += 0.0005 * rng.standard_normal(side.shape)
+    around = rng.standard_normal((3000, 3))
+    around /= np.linalg.norm(around, axis=1)[:, None]
+    left, right = (
+        middle + 0.1 * around[around @ middle < 0] for middle in (np.array([-0.4, 0, 1.4]), np.array([0.3, 0, 1.2]))
+    )
+    points = np.concatenate([side, left[:400], right])
+    nothing = fit_ground(right, depth_std=0.0005 * right[:, 2] ** 2)
+    assert nothing.plane is None
+    ground = dataclasses.replace(nothing, inliers=np.zeros(len(points), bool), depth_std=0.0005 * points[:, 2] ** 2)
+    front = foreground(points, ground, up=(0, 1, 0))
+    assert front.walls == ()
+    assert np.asarray(front.mask).all()
 
 
 def test_without_a_plane_the_foreground_is_all_but_walls():

@@ -80,19 +80,44 @@ def test_seeds_are_mountains_apart():
     np.testing.assert_allclose(np.asarray(seeds)[np.asarray(real)], taken)
 
 
+def ladder(counts, edge=()):
+    """Prominences with so many groups at each rung, 3 and 0.3 of the limit; `edge` maps (rung, rank) to others."""
+    found = np.full((8, 20), 0.3)
+    for rung, count in enumerate(counts):
+        found[rung, :count] = 3.0
+    found[:, 0] = np.inf
+    for place, value in dict(edge).items():
+        found[place] = value
+    return jnp.asarray(found)
+
+
 @pytest.mark.parametrize(
-    ("counts", "level"),
+    ("counts", "edge", "level", "number"),
     [
-        ([5, 3, 3, 3, 2, 1, 1, 1], 2),  # 3 and 1 stay as long: the narrower, at the base
-        ([5, 4, 3, 2, 2, 2, 2, 1], 3),  # 2 stays longest, from the fourth on
-        ([2, 2, 1, 1, 1, 2, 2, 2], 2),  # a number that comes back has two runs
-        ([1] * 8, 2),
-        ([8, 7, 6, 5, 4, 3, 2, 1], 2),  # none stays: the base
-        ([16, 15, 14, 11, 9, 9, 7, 5], 2),  # two alike are chance
+        ([5, 3, 3, 3, 2, 1, 1, 1], (), 2, 3),  # 3 and 1 stay as long: the narrower, at the base
+        ([5, 4, 3, 2, 2, 2, 2, 1], (), 3, 2),  # 2 stays longest, from the fourth on
+        ([2, 2, 1, 1, 1, 2, 2, 2], (), 1, 2),  # a number that comes back has all its rungs
+        ([2, 2, 1, 1, 1, 1, 1, 2], (), 2, 1),
+        ([1] * 8, (), 2, 1),
+        ([8, 7, 6, 5, 4, 3, 2, 1], (), 2, 6),  # none stays: the base
+        ([16, 15, 14, 11, 9, 9, 7, 5], (), 2, 14),  # two alike are chance
+        ([9, 8, 7, 6, 5, 5, 5, 4], {(7, 4): 0.999}, 4, 5),  # one that falls short by a hair counts half
+        ([9, 8, 7, 6, 5, 5, 4, 4], {(6, 4): 0.8}, 2, 7),  # by a fifth, not at all
     ],
 )
-def test_the_number_that_stays_longest(counts, level):
-    assert int(density._steadiest(jnp.asarray(counts))) == level
+def test_the_number_that_stays_longest(counts, edge, level, number):
+    assert tuple(map(int, density._steadiest(ladder(counts, edge)))) == (level, number)
+
+
+def test_a_number_does_not_hang_on_a_hair():
+    """With rungs counted whole the last fell to 4 groups as a prominence passed 1: 5 stayed for two, and the base was taken."""
+    edges = [ladder([16, 12, 11, 9, 6, 5, 5, 5], {(7, 4): value}) for value in (0.98, 0.999, 1.001, 1.02)]
+    assert {tuple(map(int, density._steadiest(edge))) for edge in edges} == {(5, 5)}
+
+
+def test_less_than_the_background_stands_nowhere():
+    found = ladder([4] * 8).at[:, 6:].set(-0.2)
+    assert tuple(map(int, density._steadiest(found))) == (2, 4)
 
 
 def chain(peaks, saddles):
