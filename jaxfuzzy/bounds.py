@@ -66,10 +66,12 @@ def ends_of(
         # A lid says where the side ends; how far down it goes, the side and the inner wall say.
         side = on & (part != 1)
         ends[0] = stretch(hits[side if side.sum() > 3 else on, 1])
-        if detail[0] == CLOSED:
+        # A lid that no point lies on may be anywhere.
+        held = (on & (part == 1)).any()
+        if detail[0] == CLOSED and held:
             ends[0, 1] = theta[4]
             ends[0, 0] = min(ends[0, 0], theta[4])
-        if detail[0] == OPEN and (on & (part == 1)).any():
+        if detail[0] == OPEN and held:
             ends[0, 0] = min(ends[0, 0], theta[4])
         if kind == "cone" and theta[3] != 0:
             tip = theta[2] / theta[3]
@@ -79,7 +81,7 @@ def ends_of(
         across = np.stack([c * hits[:, 0] + s * hits[:, 2], c * hits[:, 2] - s * hits[:, 0], hits[:, 1]])
         for i in range(3):
             ends[i] = stretch(across[i][on & (part != i)])
-            if detail[i]:
+            if detail[i] and (on & (part == i)).any():
                 ends[i, 1 if detail[i] > 0 else 0] = theta[1 + i]
     elif kind == "plane":
         first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]), rotation, np)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
-from jaxfuzzy.shapes import Shape
+from jaxfuzzy.shapes import Shape, refused
 from jaxfuzzy.status import Status
 from jaxfuzzy.trials import Fit, contained, held_by, lies, named_sets, some_of
 
@@ -21,6 +21,9 @@ Parted = Callable[[np.ndarray], np.ndarray]
 WHOLE, EXPLAINED, GAINED = 0.8, 0.7, 0.15
 # A part with a smaller share of its group is no object.
 SMALLEST = 0.1
+# A surface that holds less than the first share of its group is that of a part of it: what it leaves over is something else,
+# whatever that is, where it holds the second share together.
+MIXED, LARGE = 0.6, 0.2
 # A group is cut by so many of its places, with repetition where it has fewer, so that one program serves all.
 PLACES = 1024
 
@@ -109,11 +112,18 @@ def with_left_over(
     fit: Fit,
     parted: Parted,
     fewest: int,
+    nameless: bool = False,
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
-    """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these."""
+    """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these.
+
+    Where a surface holds less than `MIXED` of a group, `nameless` takes large parts that no surface holds as well.
+    """
     left: list[tuple[int, np.ndarray]] = []
+    smallest = LARGE if nameless else SMALLEST
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
-        rest, least = own[~np.asarray(shape.inliers)], max(fewest, SMALLEST * len(own))
+        rest, least = own[~np.asarray(shape.inliers)], max(fewest, smallest * len(own))
+        if nameless and held_by(shape) >= MIXED * len(own):
+            continue
         if k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
             try:
                 labels = parted(rest)
@@ -124,7 +134,9 @@ def with_left_over(
     others: dict[int, list[tuple[np.ndarray, Shape]]] = {}
     for (k, piece), shape in zip(left, fit([piece for _, piece in left]) if left else (), strict=True):
         whole = shape.primitive is not None and held_by(shape) >= EXPLAINED * len(piece)
-        if whole and not contained(points, [members[k], piece], [shapes[k], shape]):
+        if nameless and not whole and shape.primitive is not None:
+            shape = refused(shape, Status(0), "it holds too little of what another surface leaves over")
+        if (whole or nameless) and not contained(points, [members[k], piece], [shapes[k], shape]):
             others.setdefault(k, []).append((piece, shape))
     stay = {k: np.setdiff1d(members[k], np.concatenate([piece for piece, _ in of])) for k, of in others.items()}
     anew = fit(list(stay.values())) if stay else ()

@@ -56,6 +56,7 @@ def by_shapes(
     taken = gathered.union(*joined)
     divided = with_left_over(points, members, shapes, taken, fit, parted, least)
     divided |= cut_in_two(points, flat, up, members, shapes, taken.union(divided), fit, least)
+    divided |= with_left_over(points, members, shapes, taken.union(divided), fit, parted, least, nameless=True)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from jaxfuzzy.arrays import Array, Bool, Float, on_device
+from jaxfuzzy.brightness import Line, evened, line_between
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.matcher import STEP, Matcher
@@ -96,7 +97,8 @@ def disparity(
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
-    low, count = search_range(left, right, rig, matcher)
+    low, count, to_left = _glance(left, right, rig, matcher)
+    left, right = evened(left, right, to_left)
     values = _match(left, right, low, count, matcher)
     valid = (values >= low) & (values + rig.doffs_px > 0) & _textured(left)
     if matcher.left_right_px is not None:
@@ -117,41 +119,60 @@ def search_range(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple
     Both are looked for on shrunk images among all disparities that put a point before the camera, up to half the
     width or the rig's `max_disparity_px`.
     """
-    width = left.shape[1]
+    return _glance(left, right, rig, matcher)[:2]
+
+
+def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int, int, Line]:
+    """What a coarse match shows: the range of disparities, and how levels of the right image become those of the left."""
+    height, width = left.shape[:2]
     low, count = matcher.min_disparity, matcher.disparities
-    if low is None or count is None:
-        first, last = _scene_range(left, right, rig, matcher)
-        low = first if low is None else low
-        count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
-    block = max(matcher.block, BM_BLOCK) if matcher.method == "bm" else matcher.block
-    if min(left.shape[:2]) <= block or count > STEP * -(-width // STEP):
-        raise ValueError(
-            f"images are {width} pixels wide and {left.shape[0]} high, too small for {count} disparities and blocks of"
-            f" {block}: give smaller ones or larger images"
-        )
-    return low, count
+
+    def check(count: int) -> None:
+        block = max(matcher.block, BM_BLOCK) if matcher.method == "bm" else matcher.block
+        if min(height, width) <= block or count > STEP * -(-width // STEP):
+            raise ValueError(
+                f"images are {width} pixels wide and {height} high, too small for {count} disparities and blocks of"
+                f" {block}: give smaller ones or larger images"
+            )
+
+    if count is not None:
+        check(count)
+    top = width / 2 if rig.max_disparity_px is None else min(rig.max_disparity_px, width)
+    bottom = -min(max(rig.doffs_px, -top), width / 8)
+    if low is not None:
+        bottom = float(low)
+    if low is not None and count is not None:
+        top = float(low + count)
+    first, last, to_left = _coarse(left, right, matcher, bottom, top)
+    low = first if low is None else low
+    count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
+    check(count)
+    return low, count, to_left
 
 
-def _scene_range(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int, int]:
+def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: float) -> tuple[int, int, Line]:
+    """The first and last disparity between two bounds that a match of shrunk images shows, and the levels of what matches."""
     width = left.shape[1]
     shrink = -(-width // COARSE_WIDTH)
     size = (max(1, width // shrink), max(1, left.shape[0] // shrink))
-    small_left, small_right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
-    top = width / 2 if rig.max_disparity_px is None else min(rig.max_disparity_px, width)
-    bottom = -min(max(rig.doffs_px, -top), width / 8)
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right)]
+    levels = [image.reshape(size[0] * size[1], -1) for image in small]
+    one, other = evened(small[0], small[1], line_between(levels[1], levels[0]))
     low = int(np.floor(bottom / shrink))
     count = STEP * max(1, int(np.ceil((top / shrink - low) / STEP)))
     coarse = dataclasses.replace(matcher, method="sgbm", block=3)
-    values = _match(small_left, small_right, low, count, coarse)
-    mirrored = _match(small_right[:, ::-1], small_left[:, ::-1], low, count, coarse)[:, ::-1]
+    values = _match(one, other, low, count, coarse)
+    mirrored = _match(other[:, ::-1], one[:, ::-1], low, count, coarse)[:, ::-1]
     valid = _without_speckles(values, (values >= low) & _agrees(values, mirrored, low, 1.0), 20)
+    if valid.sum() < FEWEST_POINTS:
+        return int(np.floor(bottom)), int(np.ceil(top)), line_between(levels[0], levels[0])
+    at = np.flatnonzero(valid)
+    to_left = line_between(levels[1][at - np.rint(values.ravel()[at]).astype(int)], levels[0][at])
     found = np.sort(values[valid]) * shrink
-    if len(found) < FEWEST_POINTS:
-        return int(np.floor(bottom)), int(np.ceil(top))
     skip = int(RANGE_SHARE * len(found))
     # One coarse pixel of play at either end, and one more for the rounding of the coarse disparities themselves.
     first, last = found[skip] - 2 * shrink, found[-1 - skip] + 2 * shrink
-    return int(np.floor(max(first, bottom))), int(np.ceil(min(last, top)))
+    return int(np.floor(max(first, bottom))), int(np.ceil(min(last, top))), to_left
 
 
 def _match(left: Image, right: Image, low: int, count: int, matcher: Matcher) -> np.ndarray:

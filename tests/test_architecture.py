@@ -16,13 +16,13 @@ ORDER = """
     objects rays bounds starts local choice candidates screening finalists search polish fitting looks assembly mostpoints
     quadrics
     shapes trials joining dividing groups
-    cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate stereo render
+    cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate brightness stereo render
     outline pieces occlusion evidence rivals vertical scene losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal
     cli __init__
 """.split()
 DOORS = {
-    "cv2": {"rig", "rigfiles", "stereo", "photos", "calibrate", "matcher", "render", "reproject"},
+    "cv2": {"rig", "rigfiles", "stereo", "photos", "calibrate", "matcher", "render", "reproject", "brightness"},
     "optimistix": {"solve", "refine", "primitives", "tuning"},
     "sklearn": {"estimators"},
     "matplotlib": {"plot", "report", "page"},
