@@ -71,7 +71,8 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
         )
     status = int(Status.MISALIGNED) * (abs(found.rows_px) > MISALIGNED_PX)
     status |= int(Status.FEW_MATCHES) * (count < FEW_MATCHES_SHARE * valid.size)
-    cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=matcher.disparity_std_px)
+    std_px = matcher.std_px(valid.shape[0])
+    cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=std_px)
     return dataclasses.replace(cloud, status=int(cloud.status) | status)
 
 

@@ -131,6 +131,38 @@ def test_no_plane_is_an_answer():
     assert find_ground(points) is None
 
 
+def test_a_slab_through_boards_behind_each_other_is_no_ground():
+    """Where no table is seen: its residual follows the place in every patch, as those of tables and walls do not."""
+    rng = np.random.default_rng(0)
+    u, v = (c.ravel() for c in np.meshgrid(np.linspace(-0.3, 0.3, 150), np.linspace(-0.25, 0.25, 125)))
+    # Six boards upright in the camera's frame, each of which shows a strip above the one before it.
+    depth = 1.6 - 0.13 * np.floor((v + 0.25) / 0.5 * 5.999)
+    std = 0.01 * depth**2
+    points = np.stack([u, v, np.ones_like(u)], axis=1) * (depth + 0.2 * std * rng.standard_normal(len(u)))[:, None]
+    ground = fit_ground(points, depth_std=std)
+    assert ground.plane is None
+    assert int(ground.status) & Status.NO_GROUND
+    # The same without the strips is a plane that leans as the slab did.
+    depth = 1.6 - 0.13 * ((v + 0.25) / 0.5 * 5.999 - 0.5)
+    points = np.stack([u, v, np.ones_like(u)], axis=1) * (depth + 0.2 * std * rng.standard_normal(len(u)))[:, None]
+    assert fit_ground(points, depth_std=std).plane is not None
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_books_on_no_table_have_no_ground(shared_data, mirrored):
+    """A slab through their spines held a seventh of the points, and cut all that stood in it."""
+    folder = shared_data / "middlebury2005_books"
+    rig = load_rig(folder / "calib.txt")
+    left, right = (cv2.imread(str(folder / name)) for name in ("view1.png", "view5.png"))
+    if mirrored:
+        left, right = right[:, ::-1], left[:, ::-1]
+        rig = dataclasses.replace(
+            rig, center_px=(left.shape[1] - 1 - rig.center_px[0] - rig.doffs_px, rig.center_px[1])
+        )
+    cloud = reconstruct(left, right, rig)
+    assert fit_ground(cloud.points, up=(0, -1, 0), depth_std=cloud.depth_std).plane is None
+
+
 def test_a_wavy_cloth_is_called_a_slab():
     points, _, std, up, _ = scene(0.3, balls=())
     flat = points @ np.stack([np.cross([0, 0, 1.0], up), np.cross(np.cross([0, 0, 1.0], up), up)], axis=1)
@@ -359,7 +391,7 @@ def test_planes_through_patches_are_those_of_eigenvectors():
     scatter = spread @ spread.transpose(0, 2, 1)
     weights = np.stack([np.arange(50) < 25, np.arange(50) >= 25]) * rng.uniform(0.5, 1, (2, 50))
     toward = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    patches = _Patches(*map(jnp.asarray, (mean, scatter[:, PAIRS[0], PAIRS[1]], np.ones(50), mean, np.ones(50))))
+    patches = _Patches(*map(jnp.asarray, (mean, *[scatter[:, PAIRS[0], PAIRS[1]]] * 2, np.ones(50), mean, np.ones(50))))
     normals, offsets = _smallest_directions(jnp.asarray(weights), patches, jnp.asarray(toward))
     for weight, normal, offset, side in zip(weights, normals, offsets, toward, strict=True):
         share = weight / weight.sum()
