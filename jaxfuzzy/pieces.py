@@ -57,9 +57,11 @@ def without_pieces(
             goes_on, border = 0, 0
             for across, down in ((STEP, 0), (-STEP, 0), (0, STEP), (0, -STEP)):
                 other = point[row[own] + down, column[own] + across]
-                border += int(np.sum((other < 0) | (owner[other] != k)))
-                level = np.abs(depth[other] - depth[own]) <= LEVEL * float(shape.noise_distance)
-                goes_on += int(np.sum((other >= 0) & (owner[other] < 0) & ~ground[other] & level))
+                outside = (other < 0) | (owner[other] != k)
+                level = (other >= 0) & (np.abs(depth[other] - depth[own]) <= LEVEL * float(shape.noise_distance))
+                # Where it meets another object at its own depth, as where one was cut from it, nothing can be told.
+                border += int(np.sum(outside & ~(level & (owner[other] >= 0))))
+                goes_on += int(np.sum(outside & level & (owner[other] < 0) & ~ground[other]))
             if goes_on > GOES_ON * border:
                 shape = refused(shape, Status.PIECE, "its surface goes on beyond its points")
         told.append(shape)
