@@ -18,7 +18,7 @@ from jax import lax
 from jaxfuzzy.arrays import WIDE, Array, Bool, Float, Int, on_device, record
 
 # Small clusters that tile the objects (the sizes compiled); neighbours each is compared with, at so many places on the way.
-PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 256), 4, 5
+PROTOTYPES, NEIGHBOURS, STOPS = (64, 128, 192, 256), 4, 5
 SWEEPS = 10
 # Bandwidths that the number of groups is looked for at: two ladders of a factor 2 in h², interleaved, over the first one's base.
 LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
@@ -123,18 +123,20 @@ def _tile(
     """Noise clustering from seeds: with m = 2, u = D^-1 / (sum_j D_j^-1 + delta^-2). The clusters and their objective."""
     delta = DELTA * bandwidth
     blocks = _blocks(places, BLOCK), _blocks(weights, BLOCK, fill=True)
+    # Blocks of padding alone need not be looked at.
+    stop = jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)) // BLOCK + 1, 0))
 
     def update(prototypes: Array, _: None) -> tuple[Array, Array]:
-        def add(sums: tuple[Array, Array], block: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
-            place, weight = block
+        def add(i: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+            place, weight = blocks[0][i], blocks[1][i]
             inverse = jnp.where(real, 1 / _squared_distances(place, prototypes, delta), 0)
             total = inverse.sum(axis=1, keepdims=True) + delta**-2
             pull = weight[:, None] * (inverse / total) ** 2
             moments = pull.T @ jnp.concatenate([place, jnp.ones_like(place[:, :1])], axis=1)
-            return (sums[0] + moments, sums[1] + weight @ (1 / total[:, 0])), None
+            return sums[0] + moments, sums[1] + weight @ (1 / total[:, 0])
 
         start = jnp.zeros((len(prototypes), 3), places.dtype), jnp.zeros((), places.dtype)
-        (moments, objective), _ = lax.scan(add, start, blocks)
+        moments, objective = lax.fori_loop(0, stop, add, start)
         mass = moments[:, 2:]
         moved = moments[:, :2] / jnp.maximum(mass, jnp.finfo(places.dtype).tiny)
         return jnp.where(real[:, None] & (mass > 0), moved, prototypes), objective

@@ -9,6 +9,7 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
+from jaxfuzzy.looks import side_by_side
 from jaxfuzzy.shapes import Shape, refused
 from jaxfuzzy.status import Status
 from jaxfuzzy.trials import Fit, contained, held_by, lies, named_sets, some_of
@@ -118,19 +119,24 @@ def with_left_over(
 
     Where a surface holds less than `MIXED` of a group, `nameless` takes large parts that no surface holds as well.
     """
-    left: list[tuple[int, np.ndarray]] = []
-    smallest = LARGE if nameless else SMALLEST
+    smallest, rests = LARGE if nameless else SMALLEST, {}
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
         rest, least = own[~np.asarray(shape.inliers)], max(fewest, smallest * len(own))
-        if nameless and held_by(shape) >= MIXED * len(own):
-            continue
-        if k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
-            try:
-                labels = parted(rest)
-            except checks.DataError:  # too scattered: there is no part of it
-                continue
-            pieces = [rest[labels == i] for i in range(labels.max(initial=-1) + 1)]
-            left += [(k, piece) for piece in pieces if len(piece) >= least]
+        mixed = not nameless or held_by(shape) < MIXED * len(own)
+        if mixed and k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
+            rests[k] = rest
+
+    def parts_of(rest: np.ndarray) -> list[np.ndarray]:
+        try:
+            labels = parted(rest)
+        except checks.DataError:  # too scattered: there is no part of it
+            return []
+        return [rest[labels == i] for i in range(labels.max(initial=-1) + 1)]
+
+    parts = dict(zip(rests, side_by_side(parts_of, rests.values()), strict=True))
+    left = [
+        (k, piece) for k, of in parts.items() for piece in of if len(piece) >= max(fewest, smallest * len(members[k]))
+    ]
     others: dict[int, list[tuple[np.ndarray, Shape]]] = {}
     for (k, piece), shape in zip(left, fit([piece for _, piece in left]) if left else (), strict=True):
         whole = shape.primitive is not None and held_by(shape) >= EXPLAINED * len(piece)

@@ -32,11 +32,21 @@ BLOCKED = 0.5
 
 
 class Sight(NamedTuple):
-    """Some points as the camera sees them: directions (n, 3), distances (n,), and the reach of `NEIGHBOURS` of them in the view."""
+    """Some points as the camera sees them.
+
+    Attributes:
+        ray: Their directions (n, 3).
+        depth: Their distances (n,).
+        reach: The reach of `NEIGHBOURS` of them in the view.
+        middle: The middle of the view of them (3,).
+        wide: How far from it they are seen.
+    """
 
     ray: np.ndarray
     depth: np.ndarray
     reach: float
+    middle: np.ndarray
+    wide: float
 
 
 class End(NamedTuple):
@@ -69,11 +79,11 @@ def with_hidden_ends(
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
     sights = [_sight(*_seen_from(camera, points, own)) for own in on]
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
-    outliers = _seen_from(camera, points, rest)
+    outliers = _sight(*_seen_from(camera, points, rest))
     told = []
     for k, shape in enumerate(shapes):
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
-        loose = Sight(*outliers, sights[k].reach)
+        loose = outliers._replace(reach=sights[k].reach)
         before = [*(s for i, s in enumerate(sights) if i != k), loose]
         hidden = {
             end.extent
@@ -134,11 +144,14 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
 
 
 def _sight(ray: np.ndarray, depth: np.ndarray) -> Sight:
+    middle = ray.mean(axis=0) if len(ray) else np.zeros(3)
+    wide = float(lengths(ray - middle).max(initial=0.0))
     if len(ray) <= NEIGHBOURS:
-        return Sight(ray, depth, 0.0)
+        return Sight(ray, depth, 0.0, middle, wide)
     some = ray[np.linspace(0, len(ray) - 1, min(len(ray), SAMPLE)).astype(int)]
     square = np.maximum(2 - 2 * some @ ray.T, 0)
-    return Sight(ray, depth, float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS]))))
+    reach = float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS])))
+    return Sight(ray, depth, reach, middle, wide)
 
 
 def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camera: np.ndarray) -> bool:
@@ -164,6 +177,8 @@ def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camer
         middle = view.mean(axis=0)
         middle = middle / np.linalg.norm(middle)
         wide = lengths(view - middle).max() + reach
+        if np.linalg.norm(other.middle - middle) > other.wide + wide:
+            continue
         near = 2 - 2 * other.ray @ middle < wide**2
         close = 2 - 2 * view @ other.ray[near].T < reach**2
         in_front = other.depth[near] < far[:, None] - CLEARLY * float(shape.noise_distance)

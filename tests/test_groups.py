@@ -141,6 +141,25 @@ def test_what_a_body_leaves_over_is_an_object_where_a_surface_holds_it():
     assert by_shapes(points, ACROSS, parts, fit([members]), fit, scattered)[0] is parts
 
 
+@pytest.mark.parametrize(("share", "kinds"), [(0.55, ["sphere", "unknown"]), (0.7, ["sphere"])])
+def test_what_a_body_leaves_over_is_another_object_where_it_is_nearly_half(share, kinds):
+    """A ball beside a heap that no surface holds, as a hat box with a doll: the body holds too little to be all of the object."""
+    rng = np.random.default_rng(3)
+    count = round(1000 * share)
+    heap = rng.uniform(-0.06, 0.06, (1000 - count, 3)) + [0.19, 0, 1.0]
+    points = np.concatenate([ball([0, 0, 1.0], 0.1, count), heap])
+    fit = fitted_to(points, [Sphere(jnp.array([0, 0, 1.0]), jnp.asarray(0.1))])
+    parts = segment(points, ks=(1,))
+    members = np.flatnonzero(np.asarray(parts.labels) == 0)
+    apart, shapes = by_shapes(points, ACROSS, parts, fit([members]), fit, by_places(points))
+    labels = np.asarray(apart.labels)
+    np.testing.assert_array_equal(hardened(apart), labels)
+    assert [shape.kind for shape in shapes] == kinds
+    if len(kinds) == 2:
+        assert (labels[:count] == 0).mean() > 0.95
+        assert (labels[count:] == 1).mean() > 0.9
+
+
 def wall(radius, toward, count=500, seed=0):
     """An arc of 100 degrees of an upright cylinder at (0, 0, 1), on the side that z leads to or comes from."""
     rng = np.random.default_rng(seed)

@@ -65,6 +65,16 @@ def test_how_much_of_the_border_may_go_on():
         assert told(np.where(INSIDE | side, 2.0, 3.0)).kind == kind
 
 
+def test_where_a_piece_was_cut_from_another_the_rest_of_its_border_tells():
+    """Above, 95 of all 480 neighbors go on; where two sides with 240 meet another object at the same depth, 95 of 240 do."""
+    other = (COLUMNS >= 50) | (ROWS >= 45)
+    above = (ROWS < 16) & ~other
+    assert told(np.where(INSIDE | above, 2.0, 3.0)).kind == "cylinder"
+    assert told(np.where(INSIDE | other | above, 2.0, 3.0), others=other).kind == "unknown"
+    # Where the other object stands at another depth, its border is one like any.
+    assert told(np.where(INSIDE | above, 2.0, 3.0), others=other).kind == "cylinder"
+
+
 def test_a_piece_of_a_plane_is_a_plane():
     assert told(np.full(INSIDE.shape, 2.0), body=FLAT).kind == "plane"
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfuzzy import bounds, fitting, looks, starts
+from jaxfuzzy import bounds, fitting, looks, rays, starts
 from jaxfuzzy.objects import MOST, Frame, fair_order
 from jaxfuzzy.shapes import Fits, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
@@ -105,6 +105,23 @@ def test_edges_of_a_patch_do_not_hang_on_how_its_frame_leans():
     ]
     # A lean of three degrees moved edges by 0.4 % where the patch was laid level in the leaning frame.
     np.testing.assert_allclose(*found, atol=1e-6)
+
+
+def test_a_lid_and_a_face_that_no_point_lies_on_end_nothing():
+    """A polish may carry them anywhere: of a hat box the lid went to 103 m."""
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, np.pi, 800), rng.uniform(-0.5, 0.7, 800)
+    hits, on = np.stack([np.cos(angle), height, -np.sin(angle)], axis=1), np.ones(800, bool)
+    side, lid = np.zeros(800), np.array([rays.CLOSED, 0.0, 0.0])
+    ends = lambda kind, theta, part, detail: bounds.ends_of(kind, np.array(theta), hits, part, on, detail, np.eye(3))
+    low, high, _ = ends("cylinder", [0, 0, 1.0, 0, 500.0], side, lid)[0]
+    np.testing.assert_allclose([low, high], [-0.5, 0.7], atol=0.01)
+    on_lid = np.where(height > 0.65, 1, 0)
+    assert ends("cylinder", [0, 0, 1.0, 0, 0.72], on_lid, lid)[0, 1] == 0.72
+    # The same of the third face of a box, the upper one.
+    signs = np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(ends("box", [0, 0, 0, 500.0, 0], side, signs)[2, :2], [-0.5, 0.7], atol=0.01)
+    assert ends("box", [0, 0, 0, 0.72, 0], 2 * on_lid, signs)[2, 1] == 0.72
 
 
 def test_the_longer_upright_edge_of_a_box_comes_first():
