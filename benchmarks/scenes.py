@@ -8,14 +8,17 @@ most of the points belong to. What a person sees at a place of a photograph stan
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import numpy as np
 from common import RESULTS, provenance, table, timings, write
 
 import jaxfuzzy as jf
+from jaxfuzzy.photos import read_pair
 from jaxfuzzy.render import Rendered, render_pair, table_scene
 
 # folder, left, right; of lampshade1 the offset is not known, so that its lengths are in no unit and its shapes are bent
@@ -76,6 +79,8 @@ SETTINGS: tuple[dict[str, Any], ...] = (
     {"uniqueness": 5},
     {"refine": False},
 )
+# Of the other pictures that places are looked for in: size, light of the right one, how many draws of rounding and how large.
+SMALLER, DARKER, DRAWS, LAST_DIGIT = 0.8, 0.75, 3, 3e-7
 BALL_RADIUS_MM = 203.7  # of a sphere fitted to the true disparities; lengths of this pair are nominal
 NEAR_PX = 6
 
@@ -200,10 +205,55 @@ def photographs(data: Path) -> dict[str, Any]:
     }
 
 
+def variants(data: Path) -> dict[str, Any]:
+    """Places named rightly in the photographs mirrored, smaller, darker on one side, and with other last digits."""
+    rows = []
+    for name, (folder, *images) in PHOTOGRAPHS.items():
+        places = [place[1:] for place in PLACES if place[0] == name]
+        if not places:
+            continue
+        rig = rig_of(data, folder)
+        left, right = read_pair(*(data / folder / image for image in images), rig)
+        plain = jf.model_scene(left, right, rig)
+        pixels, depth = np.asarray(plain.cloud.pixels_px), np.asarray(plain.cloud.points)[:, 2]
+        disparity = rig.focal_px[0] * rig.baseline_m / depth - rig.doffs_px
+        width, height = left.shape[1], left.shape[0]
+        size = (round(SMALLER * width), round(SMALLER * height))
+        small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right)]
+        turned = dataclasses.replace(rig, center_px=(width - 1 - rig.center_px[0] - rig.doffs_px, rig.center_px[1]))
+        dark = np.rint(DARKER * right).astype(np.uint8)
+        at = {"as photographed": (plain, lambda x, y, _: (x, y))}
+        at["mirrored"] = (
+            jf.model_scene(right[:, ::-1], left[:, ::-1], turned),
+            lambda x, y, d, width=width: (width - 1 - x + d, y),
+        )
+        at["smaller"] = (jf.model_scene(*small, rig.scaled(size)), lambda x, y, _: (SMALLER * x, SMALLER * y))
+        at["right image darker"] = (jf.model_scene(left, dark, rig), lambda x, y, _: (x, y))
+        for draw in range(DRAWS):
+            noise = np.random.default_rng(draw).standard_normal(plain.cloud.points.shape)
+            points = (np.asarray(plain.cloud.points) * (1 + LAST_DIGIT * noise)).astype(np.float32)
+            cloud = dataclasses.replace(plain.cloud, points=jax.numpy.asarray(points))
+            at[f"other last digits, {draw + 1}"] = (jf.model_cloud(cloud), lambda x, y, _: (x, y))
+        for variant, (scene, moved) in at.items():
+            for seen, column, row, kinds in places:
+                near = np.abs(pixels - [column, row]).max(axis=1) <= NEAR_PX
+                shift = float(np.median(disparity[near])) if near.any() else 0.0
+                owner = owner_at(scene, *moved(column, row, shift))
+                kind = "nothing" if owner is None else scene.shapes[owner].kind
+                rows.append((variant, name, seen, kind, "yes" if kind in kinds else "no"))
+    told: dict[str, list[bool]] = {}
+    for variant, *_, right in rows:
+        told.setdefault(variant, []).append(right == "yes")
+    table(
+        f"The {len(PLACES)} places in other pictures of them",
+        ("pictures", "right"),
+        [(variant, sum(good)) for variant, good in told.items()],
+    )
+    return {"right": {variant: sum(good) for variant, good in told.items()}, "rows": rows}
+
+
 def duration(data: Path) -> dict[str, Any]:
     """Images to models, warm, beside one run of bare SGBM."""
-    import cv2
-
     rows, result = [], {}
     for name, disparities in (("cones", 64), ("cones, full size", 240)):
         folder, left, right = PHOTOGRAPHS[name]
@@ -238,7 +288,9 @@ def settings(data: Path) -> dict[str, Any]:
     return {"rows": rows}
 
 
-PARTS = {"rendered": rendered, "photographs": photographs, "settings": settings, "duration": duration}
+PARTS = {
+    "rendered": rendered, "photographs": photographs, "settings": settings, "variants": variants, "duration": duration
+}  # fmt: skip
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ independent measurement. Times are of this run on this machine; only their ratio
 import argparse
 import contextlib
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,13 @@ SETTINGS: dict[str, Matcher | None] = {
     "hh": Matcher(method="hh"),
     "bm": Matcher(method="bm"),
 }
+# Gain and offset of the grey levels, and of which image.
+LIGHT = {
+    "as photographed": (1.0, 0.0, 1),
+    "right × 0.9": (0.9, 0.0, 1),
+    "right × 0.75 + 10": (0.75, 10.0, 1),
+    "left × 0.6": (0.6, 0.0, 0),
+}
 FIGURES = ("cover", "bad2", "bad1", "median_px", "deviation_px", "bias_px", "pixels_a_point")
 
 
@@ -83,13 +91,7 @@ def line(figures: dict[str, float]) -> list[float | str]:
 
 def matching(data: Path) -> dict[str, Any]:
     results: dict[str, Any] = {}
-    for scene, (name, left_name, right_name, truth_name, scale, count) in SCENES.items():
-        folder = data / name
-        truth = read_disparity(folder / truth_name, scale=scale)
-        left, right = (cv2.imread(str(folder / image)) for image in (left_name, right_name))
-        # Three sets have no calibration; matching needs none beyond the size.
-        plain = Rig((1000, 1000), (0, 0), 0.1, (left.shape[1], left.shape[0]))
-        rig = load_rig(folder / "calib.txt") if (folder / "calib.txt").exists() else plain
+    for scene, left, right, truth, rig, count in pairs(data):
         results[scene] = {
             setting: judged(
                 *(bare(left, right, count) if matcher is None else disparity(left, right, rig, matcher=matcher)), truth
@@ -109,6 +111,46 @@ def matching(data: Path) -> dict[str, Any]:
             ]
             print(f"{setting}: {figure} worse than bare OpenCV's on {', '.join(worse) or 'no scene'}")
     return results | {"mean": means}
+
+
+def pairs(data: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, Rig, int]]:
+    """Name, images, truth, rig and number of disparities of each real pair."""
+    for scene, (name, left_name, right_name, truth_name, scale, count) in SCENES.items():
+        folder = data / name
+        truth = read_disparity(folder / truth_name, scale=scale)
+        left, right = (cv2.imread(str(folder / image)) for image in (left_name, right_name))
+        # Three sets have no calibration; matching needs none beyond the size.
+        plain = Rig((1000, 1000), (0, 0), 0.1, (left.shape[1], left.shape[0]))
+        rig = load_rig(folder / "calib.txt") if (folder / "calib.txt").exists() else plain
+        yield scene, left, right, truth, rig, count
+
+
+def brightness(data: Path) -> dict[str, Any]:
+    """The same pairs with less light in one image: means over the scenes."""
+    rows: dict[str, dict[str, list[dict[str, float]]]] = {}
+    for _, left, right, truth, rig, count in pairs(data):
+        for change, (gain, offset, which) in LIGHT.items():
+            images = [left, right]
+            images[which] = np.rint(images[which] * gain + offset).astype(np.uint8)
+            found = rows.setdefault(change, {"bare OpenCV": [], "default": []})
+            found["bare OpenCV"].append(judged(*bare(*images, count), truth))
+            found["default"].append(judged(*disparity(*images, rig), truth))
+    results = {
+        change: {
+            who: {name: float(np.mean([row[name] for row in each])) for name in ("cover", "bad2")}
+            for who, each in of.items()
+        }
+        for change, of in rows.items()
+    }
+    table(
+        f"Less light in one image, mean of {len(SCENES)} scenes",
+        ("light", "cover", "bad2", "bare OpenCV's cover", "its bad2"),
+        [
+            (change, *(of[who][name] for who in ("default", "bare OpenCV") for name in ("cover", "bad2")))
+            for change, of in results.items()
+        ],
+    )
+    return results
 
 
 def full_size(data: Path) -> dict[str, Any]:
@@ -186,7 +228,8 @@ def calibration(data: Path) -> dict[str, Any]:
 
 
 PARTS = {
-    "matching": matching, "full_size": full_size, "rendered": rendered, "duration": duration, "calibration": calibration
+    "matching": matching, "brightness": brightness, "full_size": full_size, "rendered": rendered,
+    "duration": duration, "calibration": calibration,
 }  # fmt: skip
 
 

@@ -35,8 +35,8 @@ MOST_WALLS = 4
 LOOKED_AT = 16_384
 # Through so few points there is always a plane.
 FEWEST = 10
-# A supporting plane must hold this share of the view, net of what is seen below it.
-LEAST_SUPPORT = 0.004
+# A supporting plane must hold this share of the view, net of what is seen below it; a wall, of which more is asked, that share.
+LEAST_SUPPORT, LEAST_OF_WALL = 0.004, 0.001
 # Standard deviations tried where none is given, as shares of the scene's spread.
 UNKNOWN_NOISE = (0.002, 0.004, 0.008, 0.016, 0.032)
 
@@ -255,9 +255,10 @@ def upright_rotation(up: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _fit(view: View, prior: Prior, scales: tuple[float, ...]) -> tuple[Candidate | None, float]:
     """The best plane at the smallest noise at which there is one that is no slab; and the factor on the noise."""
     best, factor = None, 1.0
+    least = LEAST_OF_WALL if bool(prior.ends_view) else LEAST_SUPPORT
     for scale in scales:
         found = fit_plane(view, prior, on_device(scale, view.points.dtype))
-        if float(found.support) >= LEAST_SUPPORT:
+        if float(found.support) >= least:
             best, factor = found, scale
             if float(found.spread) <= SLAB:
                 break

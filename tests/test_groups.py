@@ -141,6 +141,32 @@ def test_what_a_body_leaves_over_is_an_object_where_a_surface_holds_it():
     assert by_shapes(points, ACROSS, parts, fit([members]), fit, scattered)[0] is parts
 
 
+@pytest.mark.parametrize(("body", "held", "number"), [("round", 0.84, 1), ("flat", 0.84, 2), ("round", 0.95, 2)])
+def test_two_flat_strips_are_no_better_than_a_round_body_that_holds_little_less(body, held, number):
+    """A cone behind another one is seen at both sides of it: of the strips two planes held 0.84, the cone 0.67."""
+    rng = np.random.default_rng(4)
+    points = np.concatenate([rng.normal(size=(300, 3)) * [0.01, 0.05, 0.01] + [x, 0, 1.0] for x in (-0.05, 0.05)])
+    parts = segment(points, ks=(1,))
+    members = np.flatnonzero(np.asarray(parts.labels) == 0)
+    upright = Cylinder(jnp.array([0, -0.1, 1.0]), jnp.array([0, 1.0, 0]), jnp.asarray(0.06), jnp.asarray(0.2))
+    corners = jnp.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+    plane = Plane(jnp.array([0, 0, 1.0]), jnp.array([0, 0, -1.0]), corners)
+
+    def fit(sets, wholes=None, lying=None):
+        every = [len(own) > 0.8 * len(members) for own in sets]
+        first = lambda own, share: np.arange(len(own)) < share * len(own)
+        return tuple(
+            fitted_shape(upright if body == "round" else plane, first(own, 0.67), 0.03)
+            if all_of_it
+            else fitted_shape(plane, first(own, held), 0.03)
+            for own, all_of_it in zip(sets, every, strict=True)
+        )
+
+    nothing = lambda some: np.full(len(some), -1)
+    apart, shapes = by_shapes(points, ACROSS, parts, fit([members]), fit, nothing)
+    assert apart.k == len(shapes) == number
+
+
 @pytest.mark.parametrize(("share", "kinds"), [(0.55, ["sphere", "unknown"]), (0.7, ["sphere"])])
 def test_what_a_body_leaves_over_is_another_object_where_it_is_nearly_half(share, kinds):
     """A ball beside a heap that no surface holds, as a hat box with a doll: the body holds too little to be all of the object."""
