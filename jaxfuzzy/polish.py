@@ -27,6 +27,7 @@ STIFFEST, SOFTEST = 4.0, 0.3
 # Below lie the last few points before a silhouette, where a surface bends away faster than a derivative tells.
 LEAST_DAMPING = 0.2
 MOST_LEVERAGE = 0.9
+LEAST_BEND = 0.5
 PLANE, BOX, REVOLUTION, SPHERE = range(4)
 
 
@@ -184,7 +185,7 @@ def polish(
     bend = seen.own * (1 - (1 - seen.own / jnp.maximum(view.mask, 1e-12)) * seen.error**2 / end.scale**2)
     # Steps take derivatives damped at grazing incidence; how residuals really change is the undamped ones.
     bend = bend / jnp.maximum(seen.damping, LEAST_DAMPING)
-    inverse = starts.invert(normal(end.theta, seen.rows, bend, end.scale), jnp.eye(7, dtype=dtype))
+    inverse = _inverse(normal(end.theta, seen.rows, bend, end.scale), normal(end.theta, seen.rows, seen.own, end.scale))
     leverage = seen.own / end.scale**2 * (seen.rows * (inverse @ seen.rows)).sum(0)
     pull = seen.own * seen.error / end.scale / (1 - jnp.clip(leverage, 0.0, MOST_LEVERAGE))
     # The prior is one more observation, which errs as it says.
@@ -200,6 +201,17 @@ def polish(
         part=end.met.part[0],
         moved=end.moved,
     )
+
+
+def _inverse(bent: Array, steep: Array) -> Array:
+    """Inverse of the curvature, in no direction less than `LEAST_BEND` of the steep one, which knows nothing of weights that fall.
+
+    A few points beside a silhouette may bend it the other way: it is then nobody's curvature, and its inverse has any size.
+    """
+    half = jnp.linalg.inv(jnp.linalg.cholesky(steep))
+    values, vectors = jnp.linalg.eigh(half @ bent @ half.T)
+    root = half.T @ vectors
+    return (root / jnp.maximum(values, LEAST_BEND)) @ root.T
 
 
 def met_by(family: Array, theta: Array, turn: Array, detail: Array, view: View) -> Meeting:
