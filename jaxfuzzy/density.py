@@ -24,7 +24,8 @@ SWEEPS = 10
 LADDER = 2.0 ** (np.arange(8) / 4 - 0.5)
 # Rung of the base. A number of groups is steady when it stays for so many rungs; where the prominence that decides is within
 # this factor of the limit, by its logarithm, a rung counts in part, so that rounding moves no number by a whole rung.
-BASE, STEADY, SOFT = 2, 2.1, 1.16
+# Numbers that stay as long but for the last part of a rung stay as long.
+BASE, STEADY, SOFT, AS_LONG = 2, 2.1, 1.16, 0.25
 # Lengths in bandwidths: distance between seeds, noise distance, farthest neighbour, margin of the box that background is sought in.
 APART, DELTA, REACH, MARGIN = 2.0, 2.4, 7.2, 4.0
 # A seed stands so many standard deviations of a count above the background, which is the median over a lattice.
@@ -47,7 +48,7 @@ class Groups:
     Attributes:
         prototypes: Centers of the small clusters.
         group: Rank of the group that each prototype belongs to, -1 for none.
-        found: Number of groups that stays longest along the ladder of bandwidths.
+        found: Number of groups that stays longest along the ladder of bandwidths; where none stays, the one at its base.
         count: Number of groups kept.
         shares: Each place's membership in the groups, -1's share left out.
         typicality: Support of each place over the least that its group asks for; below 1 it is an outlier.
@@ -201,7 +202,7 @@ def _steadiest(prominences: Float[Array, "L C"]) -> tuple[Int[Array, ""], Int[Ar
     share = stands[:, :-1] * (1 - stands[:, 1:])
     life = share.sum(axis=0)
     # Of two that stay as long the narrower, which is the larger number.
-    most = len(life) - 1 - jnp.argmax(jnp.where(life >= life.max() - 0.25, 1, 0)[::-1])
+    most = len(life) - 1 - jnp.argmax(jnp.where(life >= life.max() - AS_LONG, 1, 0)[::-1])
     nearness = jnp.round(share[:, most], 1) - 0.01 * jnp.abs(jnp.arange(len(share)) - BASE)
     steady = life.max() >= STEADY
     level = jnp.where(steady, jnp.argmax(nearness), BASE)

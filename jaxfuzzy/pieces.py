@@ -3,7 +3,8 @@
 What a threshold takes from the ground, a wall or a cloth has a border like any group, but across that border the surface goes on
 at the same depth. Such a piece of a wall bends a little and would be a wide cylinder. The picture tells: of the pixels a few steps
 away from those of a group, in the four directions, that are not its own, it is counted how many belong to nobody, are not the
-ground, and lie as deep. Those that were not matched count as steps, since matching leaves them out there.
+ground, and lie as deep. Those that were not matched count as steps, since matching leaves them out there; those of another object
+that lie as deep do not count at all.
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,8 @@
 The variety is that of paper eqs. 12-20 in the 3D space with m = 2, its noise distance annealed. What lets it find a table of
 which little is seen is that its members are not points but small patches of the view, each with its mean and its scatter: a
 patch is near a plane when its mean lies on it AND it does not run through it. A slab through clutter holds many points, but
-hardly a patch. A plane is scored by its members, minus the patches seen behind it (nothing is seen through a table), times a
+hardly a patch, and where noise is large enough for that the points of a patch still run through it from one side to the other, by
+which it is told. A plane is scored by its members, minus the patches seen behind it (nothing is seen through a table), times a
 prior on its angle.
 """
 

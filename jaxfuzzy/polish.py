@@ -208,7 +208,10 @@ def _inverse(bent: Array, steep: Array) -> Array:
 
     A few points beside a silhouette may bend it the other way: it is then nobody's curvature, and its inverse has any size.
     """
-    half = jnp.linalg.inv(jnp.linalg.cholesky(steep))
+    # Parameters in units of their own, so that none is lost to rounding.
+    unit = lax.rsqrt(jnp.diag(steep))
+    alike = steep * unit[:, None] * unit + 8 * jnp.finfo(steep.dtype).eps * jnp.eye(len(unit), dtype=steep.dtype)
+    half = jnp.linalg.inv(jnp.linalg.cholesky(alike)) * unit
     values, vectors = jnp.linalg.eigh(half @ bent @ half.T)
     root = half.T @ vectors
     return (root / jnp.maximum(values, LEAST_BEND)) @ root.T
