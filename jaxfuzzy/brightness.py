@@ -1,8 +1,8 @@
 """Brightness of two cameras made one: a matcher compares grey levels, and where these differ smooth surfaces have no match.
 
-With nine tenths of the light in the right image, OpenCV's semi-global matching answers 75 % of the pixels of twelve real scenes in
-place of 82, with three quarters of it 67. A line from grey level to grey level a channel, fitted to the levels of pixels that match
-each other, brings all of them back. Whole images do not tell it: what one camera sees and the other does not has levels too.
+With nine tenths of the light in the right image this matching answered 75 % of the pixels of twelve real pairs in place of 82, with
+three quarters of it 67. A line from grey level to grey level a channel, fitted to the levels of pixels that match each other,
+brings all of them back. Whole images do not tell it: what one camera sees and the other does not has levels too.
 """
 
 from typing import NamedTuple

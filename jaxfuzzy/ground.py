@@ -35,7 +35,8 @@ MOST_WALLS = 4
 LOOKED_AT = 16_384
 # Through so few points there is always a plane.
 FEWEST = 10
-# A supporting plane must hold this share of the view, net of what is seen below it; a wall, of which more is asked, that share.
+# A supporting plane must hold the first share of the view, net of what is seen below it; a wall, of which other things are asked
+# too, the second.
 LEAST_SUPPORT, LEAST_OF_WALL = 0.004, 0.001
 # Standard deviations tried where none is given, as shares of the scene's spread.
 UNKNOWN_NOISE = (0.002, 0.004, 0.008, 0.016, 0.032)

@@ -3,11 +3,10 @@
 import dataclasses
 
 from jaxfuzzy import checks
-from jaxfuzzy.reproject import DISPARITY_STD_PX
+from jaxfuzzy.reproject import usual_std_px
 
 METHODS = ("sgbm", "hh", "bm")
 STEP = 16  # OpenCV searches a multiple of 16 disparities
-MEASURED_ROWS = 560  # images with more than so many rows are as sharp, not sharper
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,5 +71,4 @@ class Matcher:
 
     def std_px(self, rows: int) -> float:
         """Standard deviation of a disparity in images of so many rows."""
-        usual = DISPARITY_STD_PX * max(1.0, rows / MEASURED_ROWS)
-        return usual if self.disparity_std_px is None else float(self.disparity_std_px)
+        return usual_std_px(rows) if self.disparity_std_px is None else float(self.disparity_std_px)

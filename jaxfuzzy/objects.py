@@ -28,6 +28,8 @@ PIXELS_PER_POINT = 190
 GOLDEN = 0.6180339887498949
 # So that an upright frame known to a few degrees does no harm: ten degrees.
 LEAN = 0.1745
+# An extent below this share of the largest is none: the object is seen edge on.
+EDGE_ON = 1e-3
 # So many places along width and height of an object tell its points apart, by their bits.
 PLACES, SHIFTS = 2**16 - 1, ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555))
 # Of objects with many points so many are drawn, by a lot that changes over a small part of the spacing of points.
@@ -139,6 +141,8 @@ def fair_order(points: np.ndarray) -> np.ndarray:
     drawn at random. Of many points that holds for the first ones, which are drawn by a number that their place has, and are more
     than are ever fitted; the others follow as they come.
     """
+    if not len(points):
+        return np.zeros(0, int)
     if len(points) > 2 * DRAWN:
         drawn = (points @ TO_LOT * LOTS) % 1.0 < DRAWN / len(points)
         first = np.flatnonzero(drawn)
@@ -147,18 +151,22 @@ def fair_order(points: np.ndarray) -> np.ndarray:
 
 
 def _dealt(points: np.ndarray) -> np.ndarray:
-    order = np.argsort(_along_curve(points[:, :2]))
+    # Points of one place on the curve by their own, whatever order they come in.
+    order = np.lexsort((points @ TO_LOT, _along_curve(points)))
     turn = np.arange(len(points)) * GOLDEN % 1.0
     # Those beyond what is ever fitted need no order.
-    early = turn < MOST / max(len(points), 1)
+    early = turn < MOST / len(points)
     first = np.flatnonzero(early)
     return order[np.concatenate([first[np.argsort(turn[first], kind="stable")], np.flatnonzero(~early)])]
 
 
-def _along_curve(flat: np.ndarray) -> np.ndarray:
-    """Where places (N, 2) lie along Morton's curve: the bits of both coordinates in turn."""
-    low, extent = flat.min(axis=0, initial=np.inf), np.maximum(extents(flat), np.finfo(flat.dtype).tiny)
-    bits = ((flat - low) / extent * PLACES).astype(np.uint32)
+def _along_curve(points: np.ndarray) -> np.ndarray:
+    """Where points (N, 3) lie along Morton's curve: the bits of width and height in turn, or of depth where one of them is none."""
+    extent = extents(points)
+    wide = extent >= EDGE_ON * extent.max()
+    axes = [0, 1] if wide[:2].all() else np.sort(np.argsort(~wide, kind="stable")[:2])
+    flat, extent = points[:, axes], np.maximum(extent[axes], max(EDGE_ON * extent.max(), np.finfo(points.dtype).tiny))
+    bits = ((flat - flat.min(axis=0)) / extent * PLACES).astype(np.uint32)
     for shift, mask in SHIFTS:
         bits = (bits | bits << shift) & mask
     return np.asarray(bits[:, 0] | bits[:, 1] << 1)

@@ -79,7 +79,7 @@ def with_hidden_ends(
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
     sights = [_sight(*_seen_from(camera, points, own)) for own in on]
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
-    outliers = _sight(*_seen_from(camera, points, rest))
+    outliers = _sight(*_seen_from(camera, points, rest), reach=0.0)
     told = []
     for k, shape in enumerate(shapes):
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
@@ -143,11 +143,11 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
     return offset / np.maximum(depth, 1e-12)[:, None], depth
 
 
-def _sight(ray: np.ndarray, depth: np.ndarray) -> Sight:
+def _sight(ray: np.ndarray, depth: np.ndarray, reach: float | None = None) -> Sight:
     middle = ray.mean(axis=0) if len(ray) else np.zeros(3)
     wide = float(lengths(ray - middle).max(initial=0.0))
-    if len(ray) <= NEIGHBOURS:
-        return Sight(ray, depth, 0.0, middle, wide)
+    if reach is not None or len(ray) <= NEIGHBOURS:
+        return Sight(ray, depth, reach or 0.0, middle, wide)
     some = ray[np.linspace(0, len(ray) - 1, min(len(ray), SAMPLE)).astype(int)]
     square = np.maximum(2 - 2 * some @ ray.T, 0)
     reach = float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS])))

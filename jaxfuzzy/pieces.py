@@ -25,6 +25,8 @@ SPARSE = 100
 GOES_ON = 0.25
 # As deep means by no more than so many noise distances.
 LEVEL = 2.0
+# Of the whole border such a share must be none with another object at the same depth, or it tells nothing.
+TELLING = 0.2
 
 
 def without_pieces(
@@ -55,15 +57,16 @@ def without_pieces(
     told = []
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
         if shape.primitive is not None and not isinstance(shape.primitive, Plane | Quadric):
-            goes_on, border = 0, 0
+            goes_on, border, every = 0, 0, 0
             for across, down in ((STEP, 0), (-STEP, 0), (0, STEP), (0, -STEP)):
                 other = point[row[own] + down, column[own] + across]
                 outside = (other < 0) | (owner[other] != k)
                 level = (other >= 0) & (np.abs(depth[other] - depth[own]) <= LEVEL * float(shape.noise_distance))
+                every += int(np.sum(outside))
                 # Where it meets another object at its own depth, as where one was cut from it, nothing can be told.
                 border += int(np.sum(outside & ~(level & (owner[other] >= 0))))
                 goes_on += int(np.sum(outside & level & (owner[other] < 0) & ~ground[other]))
-            if goes_on > GOES_ON * border:
+            if goes_on > GOES_ON * border and border >= TELLING * every:
                 shape = refused(shape, Status.PIECE, "its surface goes on beyond its points")
         told.append(shape)
     return tuple(told)

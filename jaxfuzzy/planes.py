@@ -126,7 +126,8 @@ def fit_plane(view: View, prior: Prior, scale: Float[Array, ""]) -> Candidate:
         angle = jnp.arccos(jnp.clip(jnp.abs(normal @ prior.axis), 0, 1)) - center
         support = (u.sum() - hidden) / weight.sum()
         score = jnp.where(support > 0, support * jnp.exp(-0.5 * (angle / deviation) ** 2), support)
-        slab = u @ slanted > SLANTED * u.sum()
+        # Seen from above, what stands is nothing but slanted.
+        slab = (prior.eye[3] > 0) & (u @ slanted > SLANTED * u.sum())
         return jnp.where((jnp.abs(angle) <= largest) & ~edge_on & ~slab, score, -jnp.inf), support, side
 
     starts = jnp.repeat(prior.starts, OFFSETS, axis=0), _offsets(patches, prior.starts).ravel()

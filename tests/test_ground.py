@@ -255,6 +255,22 @@ def test_a_box_on_the_table_is_no_wall():
     assert np.asarray(front.mask)[face].mean() > 0.85
 
 
+def test_a_wall_is_found_where_no_camera_is_known():
+    """From above all that stands follows its place; that makes no slab of it."""
+    rng = np.random.default_rng(0)
+    floor = np.stack([rng.uniform(-1, 1, 4000), np.zeros(4000), rng.uniform(0, 2, 4000)], axis=1)
+    wall = np.stack([rng.uniform(-1, 1, 3000), rng.uniform(0, 1, 3000), np.full(3000, 2.0)], axis=1)
+    ball = rng.standard_normal((800, 3))
+    ball = 0.15 * ball / np.linalg.norm(ball, axis=1)[:, None] + [0, 0.15, 1.0]
+    points = np.concatenate([floor, wall, ball]) + 0.003 * rng.standard_normal((7800, 3))
+    ground = fit_ground(points, camera=None)
+    front = foreground(points, ground, camera=None)
+    assert len(front.walls) == 1
+    mask = np.asarray(front.mask)
+    assert mask[4000:7000].mean() < 0.02
+    assert mask[7000:].mean() > 0.9
+
+
 def test_what_is_seen_edge_on_ends_no_view():
     """The side of a shelf, nearly in line with the camera, is no wall, or all to the left of it would be background."""
     rng = np.random.default_rng(0)

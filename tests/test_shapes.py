@@ -372,6 +372,25 @@ def test_of_very_many_points_those_that_are_fitted_are_drawn_fairly_whatever_the
     assert np.abs(counts - 32).max() < 5 * np.sqrt(32)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_what_is_seen_edge_on_is_sampled_fairly_whatever_its_order(axis):
+    u, v = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 150), np.linspace(-1, 1, 100)))
+    points = np.insert(np.stack([u, v], axis=1), axis, 0.0, axis=1)
+    order = fair_order(points)
+    shuffled = np.random.default_rng(1).permutation(len(points))
+    np.testing.assert_array_equal(shuffled[fair_order(points[shuffled])[:MOST]], order[:MOST])
+    counts = np.histogram2d(*np.delete(points[order[:2048]], axis, axis=1).T, bins=8)[0]
+    assert np.abs(counts - 32).max() < 5 * np.sqrt(32)
+    # Rounding makes no extent.
+    moved = points + 1e-16 * np.random.default_rng(2).standard_normal(points.shape) * (np.arange(3) == axis)
+    np.testing.assert_array_equal(fair_order(moved)[:2048], order[:2048])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_so_few_points_have_an_order(count):
+    np.testing.assert_array_equal(np.sort(fair_order(np.zeros((count, 3)))), np.arange(count))
+
+
 def test_single_precision_without_a_camera_agrees_with_double(clouds):
     chosen = [clouds[0][i] for i in (0, 4, 6, 10, 12)]
     points, labels, noise = (a.astype(np.float32) if a.dtype == float else a for a in together(chosen))

@@ -308,6 +308,18 @@ def test_brightness_of_one_camera_may_differ(channels, gain, offset):
     assert found[1][1] < found[0][1] / min(gain, 1.0)
 
 
+def test_the_usual_error_grows_with_rows_beyond_those_it_was_measured_at():
+    for rows, expected in ((100, 0.2), (560, 0.2), (1500, 0.2 * 1500 / 560)):
+        assert Matcher().std_px(rows) == pytest.approx(expected)
+        assert Matcher(disparity_std_px=0.3).std_px(rows) == 0.3
+        values, rig = np.full((rows, 4), 8.0), dataclasses.replace(FLAT, image_size=None)
+        cloud = cloud_from_disparity(values, None, rig)
+        of_one_px = rig.focal_px[0] * rig.baseline_m / 8.0**2
+        np.testing.assert_allclose(np.asarray(cloud.depth_std) / np.asarray(cloud.depth_std)[0], 1, rtol=0.1)
+        middle = np.abs(np.asarray(cloud.pixels_px) - np.array(rig.center_px)).sum(axis=1).argmin()
+        np.testing.assert_allclose(np.asarray(cloud.depth_std)[middle], expected * of_one_px, rtol=0.02)
+
+
 def test_levels_of_matching_pixels_by_hand():
     levels = np.arange(0.0, 200.0)[:, None]
     line = line_between(levels, 0.8 * levels + 12)
@@ -324,7 +336,7 @@ def test_levels_of_matching_pixels_by_hand():
 
 @pytest.mark.parametrize("other", [np.full((50, 1), 7.0), np.arange(50.0)[:, None] * 40])
 def test_levels_that_say_nothing_change_nothing(other):
-    """One grey, or twenty times the contrast: no line leads from the one to the other."""
+    """One grey, or forty times the contrast: no line leads from the one to the other."""
     for levels in ((other, np.arange(50.0)[:, None]), (np.arange(50.0)[:, None], other)):
         np.testing.assert_array_equal(np.concatenate(line_between(*levels)), [1, 0])
 
