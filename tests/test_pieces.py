@@ -72,7 +72,7 @@ def test_where_a_piece_was_cut_from_another_the_rest_of_its_border_tells():
     assert told(np.where(INSIDE | above, 2.0, 3.0)).kind == "cylinder"
     assert told(np.where(INSIDE | other | above, 2.0, 3.0), others=other).kind == "unknown"
     # Of a gap of one column, 29 neighbors at most, nothing is said.
-    gap = (COLUMNS == 55) & ~INSIDE
+    gap = (COLUMNS == 52) & ~INSIDE
     every = ~INSIDE & ~gap
     assert told(np.full(INSIDE.shape, 2.0), others=every).kind == "cylinder"
     # Where the other object stands at another depth, its border is one like any.
