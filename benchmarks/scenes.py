@@ -92,6 +92,12 @@ def owner_at(scene: jf.Scene, column: float, row: float) -> int | None:
     return int(np.bincount(here).argmax()) if len(here) else None
 
 
+def kind_at(scene: jf.Scene, column: float, row: float) -> str:
+    """What that object is named."""
+    owner = owner_at(scene, column, row)
+    return "nothing" if owner is None else scene.shapes[owner].kind
+
+
 def rig_of(data: Path, folder: str) -> jf.Rig:
     """The cameras of a photograph; focal length and baseline alone, as its source tells them, where there is no file."""
     path = data / folder / "calib.txt"
@@ -184,8 +190,7 @@ def photographs(data: Path) -> dict[str, Any]:
     figure.savefig(RESULTS / "scenes.jpg", dpi=90, pil_kwargs={"quality": 80})
     rows = []
     for name, seen, column, row, kinds in PLACES:
-        owner = owner_at(scenes[name], column, row)
-        kind = "nothing" if owner is None else scenes[name].shapes[owner].kind
+        kind = kind_at(scenes[name], column, row)
         rows.append((name, seen, kind, "yes" if kind in kinds else "no"))
     table("What a person sees and what it is named", ("photograph", "seen", "named", "right"), rows)
     full = [shape for shape in scenes["cones, full size"].shapes if shape.kind == "cone"]
@@ -238,8 +243,7 @@ def variants(data: Path) -> dict[str, Any]:
             for seen, column, row, kinds in places:
                 near = np.abs(pixels - [column, row]).max(axis=1) <= NEAR_PX
                 shift = float(np.median(disparity[near])) if near.any() else 0.0
-                owner = owner_at(scene, *moved(column, row, shift))
-                kind = "nothing" if owner is None else scene.shapes[owner].kind
+                kind = kind_at(scene, *moved(column, row, shift))
                 rows.append((variant, name, seen, kind, "yes" if kind in kinds else "no"))
     told: dict[str, list[bool]] = {}
     for variant, *_, right in rows:
@@ -278,8 +282,7 @@ def settings(data: Path) -> dict[str, Any]:
         scene = jf.model_scene(data / folder / left, data / folder / right, rig, matcher=jf.Matcher(**options))
         wrong = []
         for seen, column, row, kinds in places:
-            owner = owner_at(scene, column, row)
-            kind = "nothing" if owner is None else scene.shapes[owner].kind
+            kind = kind_at(scene, column, row)
             wrong += [] if kind in kinds else [f"{seen} as {kind}"]
         cones = sum(shape.kind == "cone" for shape in scene.shapes)
         told = ", ".join(f"{name}={value}" for name, value in options.items()) or "default"

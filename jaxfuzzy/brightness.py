@@ -23,6 +23,9 @@ class Line(NamedTuple):
     offset: np.ndarray
 
 
+UNCHANGED = Line(np.ones(1), np.zeros(1))
+
+
 def line_between(levels: np.ndarray, other: np.ndarray) -> Line:
     """The line that makes the distribution of some levels (N, C) that of others (M, C); no change where there is none."""
     one, two = (

@@ -109,25 +109,14 @@ def _of_pieces(
     return [each[i : i + 2] for i in range(0, len(each), 2)]
 
 
-def with_left_over(
-    points: np.ndarray,
-    members: Sequence[np.ndarray],
-    shapes: Sequence[Shape],
-    taken: set[int],
-    fit: Fit,
-    parted: Parted,
-    fewest: int,
-    nameless: bool = False,
-) -> dict[int, list[tuple[np.ndarray, Shape]]]:
-    """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these.
-
-    Where a surface holds less than `MIXED` of a group, `nameless` takes large parts that no surface holds as well.
-    """
-    smallest, rests = LARGE if nameless else SMALLEST, {}
+def left_over(
+    members: Sequence[np.ndarray], shapes: Sequence[Shape], taken: set[int], parted: Parted, fewest: int
+) -> dict[int, list[np.ndarray]]:
+    """Of groups of which a surface leaves much over, the parts of what it leaves."""
+    rests = {}
     for k, (own, shape) in enumerate(zip(members, shapes, strict=True)):
-        rest, least = own[~np.asarray(shape.inliers)], max(fewest, smallest * len(own))
-        mixed = not nameless or held_by(shape) < MIXED * len(own)
-        if mixed and k not in taken and shape.primitive is not None and len(rest) >= max(least, (1 - WHOLE) * len(own)):
+        rest = own[~np.asarray(shape.inliers)]
+        if k not in taken and shape.primitive is not None and len(rest) >= max(fewest, (1 - WHOLE) * len(own)):
             rests[k] = rest
 
     def parts_of(rest: np.ndarray) -> list[np.ndarray]:
@@ -137,7 +126,25 @@ def with_left_over(
             return []
         return [rest[labels == i] for i in range(labels.max(initial=-1) + 1)]
 
-    parts = dict(zip(rests, side_by_side(parts_of, rests.values()), strict=True))
+    return dict(zip(rests, side_by_side(parts_of, rests.values()), strict=True))
+
+
+def with_left_over(
+    points: np.ndarray,
+    members: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    parts: dict[int, list[np.ndarray]],
+    fit: Fit,
+    fewest: int,
+    nameless: bool = False,
+) -> dict[int, list[tuple[np.ndarray, Shape]]]:
+    """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these.
+
+    Where a surface holds less than `MIXED` of a group, `nameless` takes large parts that no surface holds as well.
+    """
+    if nameless:
+        parts = {k: of for k, of in parts.items() if held_by(shapes[k]) < MIXED * len(members[k])}
+    smallest = LARGE if nameless else SMALLEST
     left = [
         (k, piece) for k, of in parts.items() for piece in of if len(piece) >= max(fewest, smallest * len(members[k]))
     ]

@@ -139,7 +139,7 @@ def fit_ground(
     ray, floor = noise_of(x, std, eye if isinstance(noise_distance, str) else None)
     view = view_of(x, w, ray, floor, axis, eye)
     prior = prior_of(axis, (0.0, max_tilt / 2, max_tilt), eye, dtype)
-    best, scale = _fit(view, prior, (1.0, 2.0) if known else UNKNOWN_NOISE)
+    best, scale = _fit(view, prior, (1.0, 2.0) if known else UNKNOWN_NOISE, LEAST_SUPPORT)
     normal, offset, spread, inliers = np.zeros(3, dtype), 0.0, 0.0, np.zeros(len(x), bool)
     if best is not None:
         # An exact plane has no spread; rounding is the least there is.
@@ -209,9 +209,8 @@ def foreground(
     walls: list[Plane] = []
     standing = kept.copy()
     while len(walls) < MOST_WALLS and kept.any():
-        wall, scale = _fit(
-            view_of(x, kept.astype(x.dtype), ray, floor, axis, eye), prior, (1.0, 2.0) if known else UNKNOWN_NOISE
-        )
+        view = view_of(x, kept.astype(x.dtype), ray, floor, axis, eye)
+        wall, scale = _fit(view, prior, (1.0, 2.0) if known else UNKNOWN_NOISE, LEAST_OF_WALL)
         if wall is None:
             break
         normal, offset = np.asarray(wall.normal), float(wall.offset)
@@ -253,10 +252,9 @@ def upright_rotation(up: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.cross(up, ahead), up, ahead])
 
 
-def _fit(view: View, prior: Prior, scales: tuple[float, ...]) -> tuple[Candidate | None, float]:
+def _fit(view: View, prior: Prior, scales: tuple[float, ...], least: float) -> tuple[Candidate | None, float]:
     """The best plane at the smallest noise at which there is one that is no slab; and the factor on the noise."""
     best, factor = None, 1.0
-    least = LEAST_OF_WALL if bool(prior.ends_view) else LEAST_SUPPORT
     for scale in scales:
         found = fit_plane(view, prior, on_device(scale, view.points.dtype))
         if float(found.support) >= least:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy.arrays import on_device
-from jaxfuzzy.dividing import Parted, cut_in_two, with_left_over
+from jaxfuzzy.dividing import Parted, cut_in_two, left_over, with_left_over
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.joining import parts_of_one_body
 from jaxfuzzy.segment import Segmentation
@@ -54,9 +54,11 @@ def by_shapes(
     up = np.cross(*across)
     joined = parts_of_one_body(points, flat, members, shapes, fit, camera, up)
     taken = gathered.union(*joined)
-    divided = with_left_over(points, members, shapes, taken, fit, parted, least)
+    rests = left_over(members, shapes, taken, parted, least)
+    divided = with_left_over(points, members, shapes, rests, fit, least)
     divided |= cut_in_two(points, flat, up, members, shapes, taken.union(divided), fit, least)
-    divided |= with_left_over(points, members, shapes, taken.union(divided), fit, parted, least, nameless=True)
+    still = {k: parts for k, parts in rests.items() if k not in divided}
+    divided |= with_left_over(points, members, shapes, still, fit, least, nameless=True)
     if not joined and not divided:
         return parts, shapes
     groups: list[tuple[np.ndarray, Shape, int]] = []

@@ -3,7 +3,6 @@
 import dataclasses
 
 from jaxfuzzy import checks
-from jaxfuzzy.reproject import usual_std_px
 
 METHODS = ("sgbm", "hh", "bm")
 STEP = 16  # OpenCV searches a multiple of 16 disparities
@@ -68,7 +67,3 @@ class Matcher:
         checks.integer(self.edge_px, "edge_px", at_least=0, at_most=20)
         if self.disparity_std_px is not None:
             checks.number(self.disparity_std_px, "disparity_std_px", above=0.0)
-
-    def std_px(self, rows: int) -> float:
-        """Standard deviation of a disparity in images of so many rows."""
-        return usual_std_px(rows) if self.disparity_std_px is None else float(self.disparity_std_px)

@@ -77,9 +77,10 @@ def with_hidden_ends(
         thickness: How far above it points were taken for its own.
     """
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
-    sights = [_sight(*_seen_from(camera, points, own)) for own in on]
+    seen = [_seen_from(camera, points, own) for own in on]
+    sights = [_sight(ray, depth, _reach(ray)) for ray, depth in seen]
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
-    outliers = _sight(*_seen_from(camera, points, rest), reach=0.0)
+    outliers = _sight(*_seen_from(camera, points, rest), 0.0)
     told = []
     for k, shape in enumerate(shapes):
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
@@ -143,15 +144,17 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
     return offset / np.maximum(depth, 1e-12)[:, None], depth
 
 
-def _sight(ray: np.ndarray, depth: np.ndarray, reach: float | None = None) -> Sight:
+def _sight(ray: np.ndarray, depth: np.ndarray, reach: float) -> Sight:
     middle = ray.mean(axis=0) if len(ray) else np.zeros(3)
-    wide = float(lengths(ray - middle).max(initial=0.0))
-    if reach is not None or len(ray) <= NEIGHBOURS:
-        return Sight(ray, depth, reach or 0.0, middle, wide)
+    return Sight(ray, depth, reach, middle, float(lengths(ray - middle).max(initial=0.0)))
+
+
+def _reach(ray: np.ndarray) -> float:
+    if len(ray) <= NEIGHBOURS:
+        return 0.0
     some = ray[np.linspace(0, len(ray) - 1, min(len(ray), SAMPLE)).astype(int)]
     square = np.maximum(2 - 2 * some @ ray.T, 0)
-    reach = float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS])))
-    return Sight(ray, depth, reach, middle, wide)
+    return float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS])))
 
 
 def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camera: np.ndarray) -> bool:

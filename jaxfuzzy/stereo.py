@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from jaxfuzzy.arrays import Array, Bool, Float, on_device
-from jaxfuzzy.brightness import Line, evened, line_between
+from jaxfuzzy.brightness import UNCHANGED, Line, evened, line_between
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.matcher import STEP, Matcher
@@ -71,8 +71,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
         )
     status = int(Status.MISALIGNED) * (abs(found.rows_px) > MISALIGNED_PX)
     status |= int(Status.FEW_MATCHES) * (count < FEW_MATCHES_SHARE * valid.size)
-    std_px = matcher.std_px(valid.shape[0])
-    cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=std_px)
+    cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=matcher.disparity_std_px)
     return dataclasses.replace(cloud, status=int(cloud.status) | status)
 
 
@@ -166,7 +165,7 @@ def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: flo
     mirrored = _match(other[:, ::-1], one[:, ::-1], low, count, coarse)[:, ::-1]
     valid = _without_speckles(values, (values >= low) & _agrees(values, mirrored, low, 1.0), 20)
     if valid.sum() < FEWEST_POINTS:
-        return int(np.floor(bottom)), int(np.ceil(top)), line_between(levels[0], levels[0])
+        return int(np.floor(bottom)), int(np.ceil(top)), UNCHANGED
     at = np.flatnonzero(valid)
     to_left = line_between(levels[1][at - np.rint(values.ravel()[at]).astype(int)], levels[0][at])
     found = np.sort(values[valid]) * shrink

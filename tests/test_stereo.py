@@ -16,7 +16,7 @@ from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.photos import alignment, read_disparity, read_pair, rectify
 from jaxfuzzy.primitives import Sphere
 from jaxfuzzy.render import Setting, paper_scene, render_pair, table_scene
-from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity, measure_noise
+from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity, measure_noise, usual_std_px
 from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.status import Status
 from jaxfuzzy.stereo import disparity, example_pair, reconstruct, search_range
@@ -310,14 +310,15 @@ def test_brightness_of_one_camera_may_differ(channels, gain, offset):
 
 def test_the_usual_error_grows_with_rows_beyond_those_it_was_measured_at():
     for rows, expected in ((100, 0.2), (560, 0.2), (1500, 0.2 * 1500 / 560)):
-        assert Matcher().std_px(rows) == pytest.approx(expected)
-        assert Matcher(disparity_std_px=0.3).std_px(rows) == 0.3
+        assert usual_std_px(rows) == pytest.approx(expected)
         values, rig = np.full((rows, 4), 8.0), dataclasses.replace(FLAT, image_size=None)
         cloud = cloud_from_disparity(values, None, rig)
         of_one_px = rig.focal_px[0] * rig.baseline_m / 8.0**2
         np.testing.assert_allclose(np.asarray(cloud.depth_std) / np.asarray(cloud.depth_std)[0], 1, rtol=0.1)
         middle = np.abs(np.asarray(cloud.pixels_px) - np.array(rig.center_px)).sum(axis=1).argmin()
         np.testing.assert_allclose(np.asarray(cloud.depth_std)[middle], expected * of_one_px, rtol=0.02)
+        given = cloud_from_disparity(values, None, rig, disparity_std_px=Matcher(disparity_std_px=0.3).disparity_std_px)
+        np.testing.assert_allclose(np.asarray(given.depth_std)[middle], 0.3 * of_one_px, rtol=0.02)
 
 
 def test_levels_of_matching_pixels_by_hand():
