@@ -6,6 +6,10 @@ from jaxfuzzy import checks
 
 METHODS = ("sgbm", "hh", "bm")
 STEP = 16  # OpenCV searches a multiple of 16 disparities
+FURTHEST_PX = 2047  # disparities are int16, 16 a pixel
+# Semi-global costs are int16 as well: blocks of 13 colour pixels begin to overflow, of 15 a sixth of the answers is wrong; and so does
+# a price from 23,000 on (on the cones; 11,600 does no harm).
+LARGEST_BLOCK, LARGEST_BLOCK_BM, HIGHEST_PRICE, CHANNELS = 11, 51, 16_383, 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,11 +23,11 @@ class Matcher:
             or "bm" (block matching: only where there is texture).
         min_disparity: Smallest disparity to search, whole pixels; None takes it from the scene.
         disparities: How many disparities to search, a multiple of 16; None takes it from the scene.
-        block: Side of the matched block, odd. Larger ones fatten edges ("bm" uses at least 15).
+        block: Side of the matched block, odd, up to 11; up to 51 for "bm", which uses at least 15. Larger ones fatten edges.
         smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block. The first holds slanted
             sides flat: at the usual 8 a ball comes out with 3.7 % too large a radius, at 5 with 2.1 %, and on twelve real scenes as
             many pixels are answered, of which 3.6 in place of 3.7 % are wrong by more than 2 px.
-        uniqueness: By how many per cent the best match must beat the second.
+        uniqueness: By how many per cent the best match must beat the second, below 100.
         left_right_px: Largest difference between matching left to right and right to left, the compared block wholly within both
             images' sides; None leaves the check out.
         speckle_px: Connected patches of at most so many pixels are removed; 0 keeps them.
@@ -50,20 +54,27 @@ class Matcher:
     def __post_init__(self) -> None:
         checks.choice(self.method, "method", METHODS)
         if self.min_disparity is not None:
-            checks.integer(self.min_disparity, "min_disparity", at_least=-4096, at_most=4096)
+            checks.integer(self.min_disparity, "min_disparity", at_least=-FURTHEST_PX, at_most=FURTHEST_PX)
         if self.disparities is not None:
-            checks.integer(self.disparities, "disparities", at_least=STEP, at_most=4096)
+            checks.integer(self.disparities, "disparities", at_least=STEP, at_most=2 * FURTHEST_PX)
             if self.disparities % STEP:
                 raise ValueError(f"disparities must be a multiple of {STEP}, got {self.disparities}")
-        checks.integer(self.block, "block", at_least=1, at_most=51)
+        largest = LARGEST_BLOCK_BM if self.method == "bm" else LARGEST_BLOCK
+        checks.integer(self.block, f"block with method={self.method!r}", at_least=1, at_most=largest)
         if self.block % 2 == 0:
             raise ValueError(f"block must be odd, got {self.block}")
         if len(self.smoothness) != 2 or not 0 < self.smoothness[0] < self.smoothness[1]:
             raise ValueError(f"smoothness must be two prices, 0 < first < second, got {self.smoothness}")
-        checks.integer(self.uniqueness, "uniqueness", at_least=0, at_most=100)
+        highest = HIGHEST_PRICE / (CHANNELS * self.block**2)
+        if self.method != "bm" and not self.smoothness[1] <= highest:
+            raise ValueError(
+                f"smoothness must be at most {highest:.0f} with block={self.block}, beyond which OpenCV's costs overflow, got"
+                f" {self.smoothness}"
+            )
+        checks.integer(self.uniqueness, "uniqueness", at_least=0, at_most=99)
         if self.left_right_px is not None:
             checks.number(self.left_right_px, "left_right_px", above=0.0)
-        checks.integer(self.speckle_px, "speckle_px", at_least=0)
+        checks.integer(self.speckle_px, "speckle_px", at_least=0, at_most=2**31 - 1)
         checks.integer(self.edge_px, "edge_px", at_least=0, at_most=20)
         if self.disparity_std_px is not None:
             checks.number(self.disparity_std_px, "disparity_std_px", above=0.0)

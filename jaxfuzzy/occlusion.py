@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxfuzzy.arrays import lengths, on_device
+from jaxfuzzy.looks import side_by_side
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -77,12 +78,12 @@ def with_hidden_ends(
         thickness: How far above it points were taken for its own.
     """
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
-    seen = [_seen_from(camera, points, own) for own in on]
-    sights = [_sight(ray, depth, _reach(ray)) for ray, depth in seen]
+    sights = side_by_side(lambda own: _sight_of(camera, points, own), on)
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
     outliers = _sight(*_seen_from(camera, points, rest), 0.0)
-    told = []
-    for k, shape in enumerate(shapes):
+
+    def told(k: int) -> Shape:
+        shape = shapes[k]
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
         loose = outliers._replace(reach=sights[k].reach)
         before = [*(s for i, s in enumerate(sights) if i != k), loose]
@@ -91,15 +92,16 @@ def with_hidden_ends(
             for end in ends_of(shape.primitive)
             if not _rests(end, ground, thickness) and _hidden(end, shape, sights[k], before, camera)
         }
-        if hidden:
-            body = shape.primitive
-            if isinstance(body, Box):
-                seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
-                body = dataclasses.replace(body, seen=on_device(seen))
-            status = on_device(int(shape.status) | Status.LOWER_BOUND, np.int32)
-            shape = dataclasses.replace(shape, primitive=body, status=status)
-        told.append(shape)
-    return tuple(told)
+        if not hidden:
+            return shape
+        body = shape.primitive
+        if isinstance(body, Box):
+            seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
+            body = dataclasses.replace(body, seen=on_device(seen))
+        status = on_device(int(shape.status) | Status.LOWER_BOUND, np.int32)
+        return dataclasses.replace(shape, primitive=body, status=status)
+
+    return tuple(side_by_side(told, range(len(shapes))))
 
 
 def ends_of(body: Primitive | None) -> list[End]:
@@ -142,6 +144,11 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
     offset = np.asarray(points[own[:: -(-len(own) // LOOKED_AT) or 1]] - camera, float)
     depth = lengths(offset)
     return offset / np.maximum(depth, 1e-12)[:, None], depth
+
+
+def _sight_of(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> Sight:
+    ray, depth = _seen_from(camera, points, own)
+    return _sight(ray, depth, _reach(ray))
 
 
 def _sight(ray: np.ndarray, depth: np.ndarray, reach: float) -> Sight:

@@ -17,13 +17,17 @@ Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
 SMALLEST = 32
 ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
 LEAST_SHARE = 0.2  # of matched features that must agree: real pairs 0.24 to 0.95, repeating patterns at wrong rows 0.15
+SURE_SHARE = (
+    0.4  # from which on it is told how rows differ over the picture: real pairs 0.43 and more but for a dark one
+)
+BRIGHTEST = 0.999  # this quantile of more than 8 bits becomes white: a few hot pixels would make all others dark
 
 
 def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
     """Two images ready for matching: uint8, the same size and number of channels, the size of the rig.
 
-    16-bit and floating-point images are scaled to 8 bits by the larger maximum of the two; a grey image beside a color
-    one makes both grey; an opaque alpha channel is dropped.
+    16-bit and floating-point images are scaled to 8 bits so that a thousandth of the pixels of the brighter one is white; a grey
+    image beside a color one makes both grey; an opaque alpha channel is dropped.
 
     Raises:
         FileNotFoundError: An image does not exist.
@@ -45,7 +49,7 @@ def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
     if images[0].dtype != images[1].dtype:
         raise ValueError(f"left and right must have the same type, got {images[0].dtype} and {images[1].dtype}")
     if images[0].dtype != np.uint8:
-        top = max(float(image.max()) for image in images)
+        top = max(_brightest(image) for image in images)
         images = [_eight_bits(image, top) for image in images]
     if images[0].ndim != images[1].ndim:
         images = [grey(image) for image in images]
@@ -61,11 +65,15 @@ def read_grey(value: Any, name: str) -> Image:
         TypeError: It is neither a path nor an array.
     """
     image = _image(value, name)
-    return grey(image if image.dtype == np.uint8 else _eight_bits(image, float(image.max())))
+    return grey(image if image.dtype == np.uint8 else _eight_bits(image, _brightest(image)))
+
+
+def _brightest(image: np.ndarray) -> float:
+    return float(np.quantile(image, BRIGHTEST)) or float(image.max())
 
 
 def _eight_bits(image: np.ndarray, top: float) -> Image:
-    return (image * (255.0 / max(top, 1e-12)) + 0.5).astype(np.uint8)
+    return (np.minimum(image * (255.0 / max(top, 1e-12)), 255.0) + 0.5).astype(np.uint8)
 
 
 def _decoded(data: bytes) -> Any:
@@ -116,7 +124,7 @@ def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.nd
         ValueError: It is no disparity map.
     """
     checks.number(scale, "scale", above=0.0)
-    data = read_bytes(path, "disparity")
+    data, is_image = read_bytes(path, "disparity"), False
     try:
         if data.startswith((b"Pf", b"PF")):
             values = _pfm(data)
@@ -126,7 +134,7 @@ def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.nd
                 raise ValueError(f"holds {len(arrays)} arrays, one is needed")
             values = arrays[0]
         else:
-            image = _decoded(data)
+            image, is_image = _decoded(data), True
             if image is None:
                 raise ValueError("is no image, PFM, NPY or NPZ file")
             # Middlebury's 2001 maps are grey stored as color.
@@ -135,7 +143,7 @@ def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.nd
             raise ValueError(f"must hold one number a pixel, got {values.dtype} {values.shape}")
     except ValueError as error:
         raise ValueError(f"disparity {os.fspath(path)} {one_line(error)}") from None
-    known = np.isfinite(values) if values.dtype.kind == "f" else values > 0
+    known = np.isfinite(values) & ((values > 0) if is_image or values.dtype.kind != "f" else True)
     return np.where(known, values.astype(np.float32) / np.float32(scale), np.float32(np.nan))
 
 
@@ -157,14 +165,19 @@ class Alignment:
     Attributes:
         matches: How many features support it; 0 where there were too few to say anything.
         rows_px: How much further down the right image shows things; 0 for a rectified pair.
+        corners_px: By how much that surely differs, in a corner, from the middle: cameras rolled or of different focal length.
         disparity_px: How much further left: the fifth, fiftieth and ninety-fifth of a hundred.
         swapped: Whether nearly everything appears further right in the right image.
     """
 
     matches: int
     rows_px: float
+    corners_px: float
     disparity_px: tuple[float, float, float]
     swapped: bool
+
+
+UNKNOWN = Alignment(0, 0.0, 0.0, (0.0, 0.0, 0.0), False)
 
 
 def alignment(left: Image, right: Image) -> Alignment:
@@ -181,27 +194,44 @@ def alignment(left: Image, right: Image) -> Alignment:
     ]
     (left_points, left_codes), (right_points, right_codes) = found
     if left_codes is None or right_codes is None:
-        return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
+        return UNKNOWN
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_codes, right_codes)
-    moves = np.array(
-        [np.subtract(left_points[pair.queryIdx].pt, right_points[pair.trainIdx].pt) for pair in pairs]
-    ).reshape(-1, 2) * [shrink, -shrink]  # fmt: skip
-    # Wrong pairs lie anywhere, right ones share their rows: the densest ten rows hold them.
-    rows = np.sort(moves[:, 1])
-    if len(rows) < FEWEST_FEATURES:
-        return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
-    held = np.searchsorted(rows, rows + 10) - np.arange(len(rows))
-    middle = np.median(rows[held.argmax() :][: held.max()])
-    good = moves[np.abs(moves[:, 1] - middle) <= 2.5 * shrink]
-    if len(good) < max(FEWEST_FEATURES, LEAST_SHARE * len(moves)):
-        return Alignment(0, 0.0, (0.0, 0.0, 0.0), False)
-    across = np.percentile(good[:, 0], [5, 50, 95])
+    if len(pairs) < FEWEST_FEATURES:
+        return UNKNOWN
+    ends = np.array([left_points[pair.queryIdx].pt + right_points[pair.trainIdx].pt for pair in pairs])
+    x, y, right_x, right_y = shrink * ends.T
+    across, down = x - right_x, right_y - y
+    where = np.stack([np.ones_like(x), 2 * x / left.shape[1] - 1, 2 * y / left.shape[0] - 1], axis=1)
+    plane, good = _rows(where, down, 2.5 * shrink)
+    if good.mean() < SURE_SHARE:
+        plane, good = _rows(where[:, :1], down, 2.5 * shrink)
+    if good.sum() < max(FEWEST_FEATURES, LEAST_SHARE * len(pairs)):
+        return UNKNOWN
+    spread = (down - where[:, : len(plane)] @ plane)[good].var()
+    error = np.sqrt(np.diag(np.linalg.pinv(where[good].T @ where[good]) * spread))[: len(plane)]
+    low, middle, high = np.percentile(across[good], [5, 50, 95])
     return Alignment(
-        matches=len(good),
-        rows_px=float(good[:, 1].mean()),
-        disparity_px=(float(across[0]), float(across[1]), float(across[2])),
-        swapped=bool(np.mean(good[:, 0] < -1) > 0.9),
+        matches=int(good.sum()),
+        rows_px=float(plane[0]),
+        corners_px=float(np.maximum(np.abs(plane) - 2 * error, 0)[1:].sum()),
+        disparity_px=(float(low), float(middle), float(high)),
+        swapped=bool(np.mean(across[good] < -1) > 0.9),
     )
+
+
+def _rows(where: np.ndarray, down: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far down things are shown, as a plane over the picture, and which pairs lie on it; wrong ones, anywhere, do no harm.
+
+    Right pairs share their rows, or nearly so where a camera is rolled: the densest rows hold them, fewer and fewer of them.
+    """
+    plane = np.zeros(where.shape[1])
+    for width in (16 * reach, 8 * reach, 4 * reach, 2 * reach):
+        rest = down - where @ plane
+        rows = np.sort(rest)
+        held = np.searchsorted(rows, rows + width) - np.arange(len(rows))
+        near = np.abs(rest - np.median(rows[held.argmax() :][: held.max()])) <= width / 2
+        plane = np.linalg.lstsq(where[near], down[near], rcond=None)[0]
+    return plane, np.abs(down - where @ plane) <= reach
 
 
 def rectify(left: Any, right: Any, rig: Rig) -> tuple[Image, Image, Rig]:

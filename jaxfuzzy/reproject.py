@@ -20,6 +20,8 @@ from jaxfuzzy.status import Status
 # to 560 rows. The left-right residual and local differences understate it two to nine times. Images with more rows are as sharp,
 # not sharper: at 1,500 rows 0.6 px were measured.
 DISPARITY_STD_PX, MEASURED_ROWS = 0.2, 560
+# What is seen further left than the picture is wide is none; a few columns cut out of one may have larger ones.
+NARROWEST_PX = 64
 
 
 def usual_std_px(rows: int) -> float:
@@ -46,7 +48,7 @@ def cloud_from_disparity(
         The points in row order of their pixels, with colors, `depth_std` and `pixels_px`.
 
     Raises:
-        ValueError: Shapes disagree or disparities are OpenCV's fixed point.
+        ValueError: Shapes disagree, disparities are multiples of pixels, or a standard deviation is not above 0.
         DataError: No pixel is left.
     """
     disparity = np.asarray(disparity_px)
@@ -59,11 +61,17 @@ def cloud_from_disparity(
     valid = np.isfinite(disparity) & (disparity > 0) if valid is None else _mask(valid, disparity.shape)
     with np.errstate(invalid="ignore"):
         valid = valid & np.isfinite(disparity) & (disparity + rig.doffs_px > 0)
+    largest = float(disparity[valid].max(initial=0))
+    if largest > max(disparity.shape[1], NARROWEST_PX):
+        raise ValueError(
+            f"disparity_px must be in pixels, got {largest:g} in an image {disparity.shape[1]} wide: files hold multiples, 16 of"
+            " them a pixel (OpenCV), 256 (KITTI) or 4 (Middlebury), see read_disparity"
+        )
     scale = rig.focal_px[0] * rig.baseline_m
     depth = np.full_like(disparity, np.nan)
     depth[valid] = scale / (disparity[valid] + np.asarray(rig.doffs_px, disparity.dtype))
     std_px = usual_std_px(len(disparity)) if disparity_std_px is None else disparity_std_px
-    return _cloud(depth, valid, rig, image, _std(std_px, disparity) * depth**2 / scale)
+    return _cloud(depth, valid, rig, image, _std(std_px, disparity, valid) * depth**2 / scale)
 
 
 def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, depth_std: Any = None) -> Cloud:
@@ -80,16 +88,20 @@ def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, d
         The points in row order of their pixels, with colors, `depth_std` and `pixels_px`.
 
     Raises:
-        ValueError: Shapes disagree.
+        ValueError: Shapes disagree, depths are whole numbers, or a standard deviation is not above 0.
         DataError: No pixel is left.
     """
+    if np.asarray(depth_m).dtype.kind in "iu":
+        raise ValueError(
+            f"depth_m must be in metres, got {np.asarray(depth_m).dtype}, which depth cameras give in millimetres: multiply by 0.001"
+        )
     depth = _map(np.asarray(depth_m), "depth_m", rig)
     known = np.isfinite(depth) & (depth > 0)
     valid = known if valid is None else _mask(valid, depth.shape) & known
     if depth_std is None:
         std = usual_std_px(len(depth)) * depth**2 / (rig.focal_px[0] * rig.baseline_m)
     else:
-        std = np.broadcast_to(_std(depth_std, depth, "depth_std"), depth.shape)
+        std = np.broadcast_to(_std(depth_std, depth, valid, "depth_std"), depth.shape)
     return _cloud(depth, valid, rig, image, std)
 
 
@@ -204,10 +216,12 @@ def _mask(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return mask.astype(bool)
 
 
-def _std(value: Any, like: np.ndarray, name: str = "disparity_std_px") -> np.ndarray:
+def _std(value: Any, like: np.ndarray, valid: np.ndarray, name: str = "disparity_std_px") -> np.ndarray:
     std = np.asarray(value, like.dtype)
     if std.shape == ():
         checks.number(value, name, above=0.0)
     elif std.shape != like.shape:
         raise ValueError(f"{name} must be one number or of shape {like.shape}, got {std.shape}")
+    elif not np.all((std[valid] > 0) & np.isfinite(std[valid])):
+        raise ValueError(f"{name} must be finite and above 0 at every valid pixel")
     return std

@@ -16,8 +16,8 @@ from jaxfuzzy.arrays import Array, Bool, Float, on_device
 from jaxfuzzy.brightness import UNCHANGED, Line, evened, line_between
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.matcher import STEP, Matcher
-from jaxfuzzy.photos import Image, alignment, grey, read_pair, rectify
+from jaxfuzzy.matcher import FURTHEST_PX, STEP, Matcher
+from jaxfuzzy.photos import Alignment, Image, alignment, grey, read_pair, rectify
 from jaxfuzzy.reproject import cloud_from_disparity
 from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.status import Status
@@ -48,20 +48,14 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
     Raises:
         FileNotFoundError: An image does not exist.
         ValueError: An image cannot be used or sizes disagree.
-        DataError: Fewer than 50 pixels were matched, or left and right are swapped.
+        DataError: Fewer than 50 pixels were matched, or left and right are swapped or one and the same.
     """
     matcher = Matcher() if matcher is None else matcher
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         left, right, rig = rectify(left, right, rig)
-    found = alignment(left, right)
-    if found.swapped and matcher.min_disparity is None:
-        raise DataError(
-            "left and right seem to be swapped: things appear further right in the right image"
-            f" ({found.disparity_px[1]:.0f} px in the middle of {found.matches} matches); where that is right because the"
-            " cameras look inwards, give Matcher(min_disparity=...)"
-        )
-    disparity_px, valid = disparity(left, right, rig, matcher=matcher)
+    found = _checked(left, right, matcher)
+    disparity_px, valid = _matched(left, right, rig, matcher)
     count = int(np.asarray(valid).sum())
     if count < FEWEST_POINTS:
         rows = f"rows differ by {found.rows_px:+.1f} px" if found.matches else "no common features were found"
@@ -69,7 +63,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
             f"only {count} of {valid.size} pixels were matched, {FEWEST_POINTS} are needed: check that the images are"
             f" rectified ({rows}), the range of disparities, and that there is texture"
         )
-    status = int(Status.MISALIGNED) * (abs(found.rows_px) > MISALIGNED_PX)
+    status = int(Status.MISALIGNED) * (max(abs(found.rows_px), found.corners_px) > MISALIGNED_PX)
     status |= int(Status.FEW_MATCHES) * (count < FEW_MATCHES_SHARE * valid.size)
     cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=matcher.disparity_std_px)
     return dataclasses.replace(cloud, status=int(cloud.status) | status)
@@ -92,11 +86,32 @@ def disparity(
     Raises:
         FileNotFoundError: An image does not exist.
         ValueError: An image cannot be used, sizes disagree, the rig is not rectified or the image is too narrow.
+        DataError: Left and right are swapped or one and the same.
     """
     matcher = Matcher() if matcher is None else matcher
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
+    _checked(left, right, matcher)
+    return _matched(left, right, rig, matcher)
+
+
+def _checked(left: Image, right: Image, matcher: Matcher) -> Alignment:
+    """What features say of the pair, unless it is none."""
+    if np.array_equal(left, right) and np.ptp(left):
+        raise DataError("left and right are the same picture: give the photographs of two cameras")
+    found = alignment(left, right)
+    if found.swapped and matcher.min_disparity is None:
+        raise DataError(
+            "left and right seem to be swapped: things appear further right in the right image"
+            f" ({found.disparity_px[1]:.0f} px in the middle of {found.matches} matches); where that is right because the"
+            " cameras look inwards, give Matcher(min_disparity=...)"
+        )
+    return found
+
+
+def _matched(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[Array, Array]:
+    """Disparities of a pair that is one."""
     low, count, to_left = _glance(left, right, rig, matcher)
     left, right = evened(left, right, to_left)
     values = _match(left, right, low, count, matcher)
@@ -135,6 +150,13 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
                 f" {block}: give smaller ones or larger images"
             )
 
+    def check_reach(low: int, count: int) -> None:
+        if not -FURTHEST_PX <= low <= low + count <= FURTHEST_PX + STEP:
+            raise ValueError(
+                f"disparities of {low} to {low + count} pixels are beyond the {FURTHEST_PX} that OpenCV's matchers can say:"
+                " shrink the images, and scale the rig with them"
+            )
+
     if count is not None:
         check(count)
     top = width / 2 if rig.max_disparity_px is None else min(rig.max_disparity_px, width)
@@ -147,6 +169,7 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
     low = first if low is None else low
     count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
     check(count)
+    check_reach(low, count)
     return low, count, to_left
 
 

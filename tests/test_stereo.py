@@ -231,13 +231,14 @@ def test_narrow_images_are_refused_and_answers_repeat():
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (40, 60), np.uint8)
     rig = Rig((100, 100), (30, 20), 0.1, (60, 40))
+    moved = np.roll(picture, -4, axis=1)
     with pytest.raises(ValueError, match="60 pixels wide and 40 high, too small for 80 disparities"):
-        disparity(picture, picture, rig, matcher=Matcher(disparities=80, min_disparity=0))
+        disparity(picture, moved, rig, matcher=Matcher(disparities=80, min_disparity=0))
     with pytest.raises(ValueError, match="blocks of 41"):
-        disparity(picture, picture, rig, matcher=Matcher(method="bm", block=41))
+        disparity(picture, moved, rig, matcher=Matcher(method="bm", block=41))
     with pytest.raises(ValueError, match="at least 32 pixels wide and high, got 5 x 40"):
         disparity(picture[:, :5], picture[:, :5], dataclasses.replace(rig, image_size=None))
-    first, *others = [disparity(picture, np.roll(picture, -4, axis=1), rig) for _ in range(3)]
+    first, *others = [disparity(picture, moved, rig) for _ in range(3)]
     for other in others:
         np.testing.assert_array_equal(first[0], other[0])
     np.testing.assert_allclose(np.median(first[0][first[1]]), 4, atol=0.05)
@@ -432,8 +433,28 @@ def test_swapped_images_are_noticed(table):
     with pytest.raises(DataError, match=r"swapped.*min_disparity"):
         reconstruct(table.right, table.left, table.rig)
     left, right, rig = example_pair()
-    with pytest.raises(DataError, match="swapped"):
-        reconstruct(right, left, rig)
+    for match in (reconstruct, disparity):
+        with pytest.raises(DataError, match="swapped"):
+            match(right, left, rig)
+        with pytest.raises(DataError, match="the same picture"):
+            match(left, left, rig)
+
+
+@pytest.mark.parametrize(
+    ("roll", "zoom", "told"), [(0.0, 1.0, False), (1.0, 1.0, True), (-2.0, 1.0, True), (0.0, 1.02, True)]
+)
+def test_rolled_or_zoomed_cameras_are_told(roll, zoom, told):
+    """Rows then match in the middle of the picture and nowhere else: the mean of all says nothing."""
+    left, right, rig = example_pair()
+    left, right = cv2.imread(str(left)), cv2.imread(str(right))
+    height, width = right.shape[:2]
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), roll, zoom)
+    turned = cv2.warpAffine(right, turn, (width, height), borderMode=cv2.BORDER_REFLECT)
+    found = alignment(left, turned)
+    corner = abs(np.deg2rad(roll)) * width / 2 + (zoom - 1) * height / 2
+    # What is surely so lies below it by two standard errors, about 0.4 px each.
+    assert corner - 1.2 < found.corners_px < corner + 0.4
+    assert bool(reconstruct(left, turned, rig).status & Status.MISALIGNED) == told
 
 
 @pytest.mark.parametrize(("down", "told"), [(0.0, False), (0.3, False), (1.5, True), (-2.0, True)])
@@ -455,6 +476,7 @@ def test_nothing_is_said_about_rows_where_features_repeat(shared_data):
     for left, right in zip(lefts, rights, strict=True):
         found = alignment(*rectify(left, right, rig)[:2])
         assert abs(found.rows_px) < 0.5
+        assert found.corners_px == 0
         assert not found.swapped
 
 
@@ -558,7 +580,12 @@ def test_sixteen_bits_floats_alpha_and_grey(table):
         other_gain = np.polyfit(right[::7, ::7].ravel().astype(float), other[::7, ::7].ravel().astype(float), 1)[0]
         assert gain == pytest.approx(other_gain, rel=1e-2), "the two images were scaled differently"
     one, other = read_pair(left.astype(np.uint16) * 16, right.astype(np.uint16) * 4, table.rig)
-    assert other.max() <= one.max() // 4 + 1, "the darker image was brightened"
+    assert other.mean() < 0.3 * one.mean(), "the darker image was brightened"
+    hot = left.astype(np.uint16) * 4
+    hot[3, 5] = 65535
+    assert read_pair(hot, right.astype(np.uint16) * 4, table.rig)[0].mean() > 0.9 * left.mean(), (
+        "one pixel made all dark"
+    )
 
 
 GREY = np.zeros((240, 320), np.uint8)
@@ -595,13 +622,18 @@ def test_images_that_cannot_be_used(left, right, error, says):
         ({"disparities": 40}, ValueError, "multiple of 16, got 40"),
         ({"disparities": 0}, ValueError, "disparities must be at least 16"),
         ({"block": 4}, ValueError, "block must be odd, got 4"),
-        ({"block": 99}, ValueError, "at most 51"),
+        ({"block": 13}, ValueError, "block with method='sgbm' must be at least 1 and at most 11"),
+        ({"block": 53, "method": "bm"}, ValueError, "at most 51"),
+        ({"smoothness": (5, 700)}, ValueError, "smoothness must be at most 607 with block=3"),
+        ({"smoothness": (5, np.inf)}, ValueError, "smoothness must be at most"),
+        ({"min_disparity": -4096}, ValueError, "min_disparity must be at least -2047"),
         ({"method": "fast"}, ValueError, "method must be one of 'sgbm', 'hh', 'bm', got 'fast'"),
         ({"smoothness": (8, 8)}, ValueError, "0 < first < second"),
         ({"left_right_px": 0.0}, ValueError, "left_right_px must be a finite number above 0"),
         ({"min_disparity": 1.5}, TypeError, "min_disparity must be a whole number"),
         ({"disparity_std_px": -1}, ValueError, "disparity_std_px must be"),
-        ({"uniqueness": 101}, ValueError, "uniqueness must be at least 0 and at most 100"),
+        # OpenCV divides by what is left of a hundred.
+        ({"uniqueness": 100}, ValueError, "uniqueness must be at least 0 and at most 99"),
     ],
 )
 def test_settings_that_cannot_be(settings, error, says):
@@ -609,7 +641,35 @@ def test_settings_that_cannot_be(settings, error, says):
         Matcher(**settings)
 
 
+def test_disparities_beyond_what_opencv_can_say_are_refused():
+    picture = np.random.default_rng(0).integers(0, 255, (48, 4600), np.uint8)
+    rig = Rig((4000, 4000), (2300, 24), 0.5, (4600, 48))
+    with pytest.raises(ValueError, match="disparities of 2032 to 2096 pixels are beyond the 2047"):
+        disparity(picture, np.roll(picture, -2040, 1), rig, matcher=Matcher(min_disparity=2032, disparities=64))
+
+
 # Ready disparities
+
+
+def test_multiples_of_pixels_and_millimetres_are_refused():
+    values = np.full((2, 4), 8.0)
+    for name, wrong in (("OpenCV", 16 * values), ("KITTI", (256 * values).astype(np.uint16))):
+        with pytest.raises(ValueError, match=f"disparity_px must be in pixels, got .* in an image 4 wide.*{name}"):
+            cloud_from_disparity(wrong, None, FLAT)
+    with pytest.raises(ValueError, match="depth_m must be in metres, got uint16.* multiply by 0.001"):
+        cloud_from_depth((1000 * values).astype(np.uint16), None, FLAT)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, 0.0, -0.2])
+def test_maps_of_errors_are_checked_where_they_count(wrong):
+    values, errors = np.full((2, 4), 3.0), np.full((2, 4), 0.2)
+    errors[1, 2] = wrong
+    with pytest.raises(ValueError, match="disparity_std_px must be finite and above 0"):
+        cloud_from_disparity(values, None, FLAT, disparity_std_px=errors)
+    with pytest.raises(ValueError, match="depth_std must be finite and above 0"):
+        cloud_from_depth(values, None, FLAT, depth_std=errors)
+    values[1, 2] = np.nan
+    assert len(cloud_from_disparity(values, None, FLAT, disparity_std_px=errors).points) == 7
 
 
 def test_encodings_of_ready_disparities(tmp_path):
