@@ -166,6 +166,12 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     add("--board", type=_board, default=(9, 6), metavar="CxR", help="inner corners a row and rows (default: 9x6)")
     add("--square", type=_length, required=True, metavar="M", help="edge of one square in metres")
     add("--marker", type=_length, metavar="M", help="edge of one marker in metres, where the board is a ChArUco board")
+    add(
+        "--dictionary",
+        default="DICT_4X4_50",
+        metavar="NAME",
+        help="markers of a ChArUco board, as OpenCV names them (default: DICT_4X4_50)",
+    )
     add("--out", type=Path, default=Path("rig.json"), metavar="FILE", help="where to write the rig (default: rig.json)")
 
 

@@ -1,6 +1,8 @@
 """Calibration of a stereo rig from photographs of a chessboard or a ChArUco board."""
 
 import dataclasses
+import itertools
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,12 +12,18 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.photos import Image, read_grey
-from jaxfuzzy.rig import Calibration, Rig
+from jaxfuzzy.rig import Calibration, Rig, warn_of_unit
 
 FEWEST_PAIRS = 3
 # A pair is left out when its error is so many times the median and more than a pixel, or when the pose of its two
 # cameras to each other is so far from the median of all pairs (radians, and share of the baseline).
 WORST_ERROR, WORST_ERROR_PX, WORST_TURN, WORST_SHIFT = 3.0, 1.0, 0.1, 0.25
+# No cameras are found where all pairs together err by more: photographs of one moment have 0.1 to 1 px, of two moments 50.
+HOPELESS_PX = 5.0
+# A board tells nothing of the lenses unless it is tilted, in some pair, by so many radians against the mean of all.
+LEAST_TILT = 0.07
+# Corners lie on one line where they spread so little across it, as a share of their spread along it.
+LINE = 0.05
 
 
 @dataclasses.dataclass
@@ -56,8 +64,9 @@ def calibrate(
 
     Raises:
         FileNotFoundError: An image does not exist.
-        ValueError: The lists differ in length, an image or the board cannot be used.
-        DataError: The board was found in fewer than 3 pairs, or the lists are swapped.
+        ValueError: The lists differ in length or hold the same picture, an image or the board cannot be used.
+        DataError: The board was found in fewer than 3 pairs or always in the same pose, the lists are swapped, or their pairs are
+            not of the same moments.
     """
     if len(left_images) != len(right_images):
         raise ValueError(f"left_images and right_images must be pairs, got {len(left_images)} and {len(right_images)}")
@@ -72,7 +81,7 @@ def calibrate(
         reasons = "; ".join(sorted({reason for _, reason in left_out}))
         raise DataError(
             f"the board of {board[0]} x {board[1]} inner corners was found in {len(views)} of {len(left_images)} pairs,"
-            f" {FEWEST_PAIRS} are needed ({reasons})"
+            f" {FEWEST_PAIRS} are needed{f' ({reasons})' if reasons else ''}"
         )
     views, strange = _consistent(views, size)
     left_out += strange
@@ -84,6 +93,13 @@ def calibrate(
         left_out.append((views[worst].pair, f"reprojection error of {errors[worst]:.1f} px"))
         del views[worst]
     shift = np.ravel(translation)
+    if not rms < HOPELESS_PX:
+        raise DataError(
+            f"no two cameras explain these pairs: the corners are off by {rms:.0f} px; are both lists in the same order, and"
+            " is each pair of one moment?"
+        )
+    if abs(shift[0]) < max(abs(shift[1]), abs(shift[2])):
+        raise DataError("one camera seems to stand above or before the other; only side by side is supported")
     if shift[0] > 0:
         raise DataError("left_images seem to be those of the right camera: swap the two lists")
     found = Calibration(
@@ -93,7 +109,7 @@ def calibrate(
         pair_rms_px=tuple(errors.tolist()),
         left_out=tuple(sorted(left_out)),
     )
-    return Rig(
+    rig = Rig(
         focal_px=(left[0][0, 0], left[0][1, 1]),
         center_px=(left[0][0, 2], left[0][1, 2]),
         baseline_m=float(np.linalg.norm(shift)),
@@ -105,6 +121,8 @@ def calibrate(
         translation=(float(shift[0]), float(shift[1]), float(shift[2])),
         calibration=found,
     )
+    warn_of_unit(rig, "the rig found", "square_m is the side of a square in metres, 0.025 for one of 25 mm")
+    return rig
 
 
 def _chessboard(board: tuple[int, int], square_m: float) -> Any:
@@ -143,6 +161,11 @@ def _charuco(board: tuple[int, int], square_m: float, marker_m: float, dictionar
     if marker_m >= square_m:
         raise ValueError(f"marker_m must be below square_m, {square_m}, got {marker_m}")
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    needed, there = (board[0] + 1) * (board[1] + 1) // 2, len(markers.bytesList)
+    if needed > there:
+        raise ValueError(
+            f"dictionary must have the {needed} markers of the board, got {dictionary!r}, which has {there}"
+        )
     pattern = cv2.aruco.CharucoBoard((board[0] + 1, board[1] + 1), square_m, marker_m, markers)
     detector = cv2.aruco.CharucoDetector(pattern)
 
@@ -162,14 +185,14 @@ def _views(
     left_images: Sequence[Any], right_images: Sequence[Any], find: Any
 ) -> tuple[list[_View], list[tuple[int, str]], tuple[int, int]]:
     """The board in every pair in which both cameras see enough of it, and why in the others not."""
-    views, left_out, size = [], [], (0, 0)
+    views: list[_View] = []
+    left_out: list[tuple[int, str]] = []
+    sizes: dict[int, tuple[tuple[int, int], ...]] = {}
     for pair, (left_image, right_image) in enumerate(zip(left_images, right_images, strict=True)):
         images = [read_grey(left_image, f"left_images[{pair}]"), read_grey(right_image, f"right_images[{pair}]")]
-        if pair == 0:
-            size = (images[0].shape[1], images[0].shape[0])
-        if any(image.shape[::-1] != size for image in images):
-            left_out.append((pair, f"not {size[0]} x {size[1]} as the first image"))
-            continue
+        if np.array_equal(*images) and np.ptp(images[0]):
+            raise ValueError(f"left_images[{pair}] and right_images[{pair}] are the same picture: give both cameras'")
+        sizes[pair] = tuple((image.shape[1], image.shape[0]) for image in images)
         found = [find(image) for image in images]
         missing = [name for name, corners in zip(("left", "right"), found, strict=True) if corners is None]
         if missing:
@@ -177,8 +200,8 @@ def _views(
             continue
         (left, left_numbers), (right, right_numbers) = found
         both, at_left, at_right = np.intersect1d(left_numbers, right_numbers, return_indices=True)
-        if len(both) < 6:
-            left_out.append((pair, "fewer than 6 corners seen by both cameras"))
+        if len(both) < 6 or _on_a_line(find.places[both]):
+            left_out.append((pair, "fewer than 6 corners, or only some on one line, seen by both cameras"))
             continue
         left, right = left[at_left], right[at_right]
         # A board whose corners look the same upside down may be counted from either end. Cameras side by side are not
@@ -186,7 +209,17 @@ def _views(
         if len(both) == len(find.places) and (left[-1] - left[0]) @ (right[-1] - right[0]) < 0:
             right = right[::-1]
         views.append(_View(pair, find.places[both], np.ascontiguousarray(left), np.ascontiguousarray(right)))
-    return views, left_out, size
+    # One photograph of another size must not rule out all the others, be it the first.
+    size = Counter(itertools.chain.from_iterable(sizes.values())).most_common(1)[0][0] if sizes else (0, 0)
+    other = {pair for pair, of in sizes.items() if set(of) != {size}}
+    left_out = [(pair, why) for pair, why in left_out if pair not in other]
+    left_out += [(pair, f"not {size[0]} x {size[1]} as most images") for pair in sorted(other)]
+    return [view for view in views if view.pair not in other], left_out, size
+
+
+def _on_a_line(places: np.ndarray) -> bool:
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= LINE * spread[0])
 
 
 def _consistent(views: list[_View], size: tuple[int, int]) -> tuple[list[_View], list[tuple[int, str]]]:
@@ -196,6 +229,11 @@ def _consistent(views: list[_View], size: tuple[int, int]) -> tuple[list[_View],
     for corners in ([view.left for view in views], [view.right for view in views]):
         vectors, places = cv2.calibrateCamera(boards, corners, size, None, None)[3:]
         poses.append([(cv2.Rodrigues(vector)[0], place) for vector, place in zip(vectors, places, strict=True)])
+    facing = np.stack([turn[:, 2] for turn, _ in poses[0]])
+    if np.linalg.norm(facing - facing.mean(axis=0), axis=1).max() < LEAST_TILT:
+        raise DataError(
+            "the board faces the same way in every pair, which tells nothing of the lenses: tilt it differently"
+        )
     turns = np.stack([after @ before.T for (before, _), (after, _) in zip(*poses, strict=True)])
     shifts = np.stack([np.ravel(b - turn @ a) for turn, (_, a), (_, b) in zip(turns, *poses, strict=True)])
     axes = np.stack([np.ravel(cv2.Rodrigues(turn)[0]) for turn in turns])

@@ -126,9 +126,7 @@ def _cluster(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         table.check_suffix(args.out)
-        _check_file(args.out)
-        if args.out.exists() and args.points.exists() and args.out.samefile(args.points):
-            raise ValueError(f"out must not be the input, got {args.out}")
+        _check_file(args.out, args.points)
     names, points = table.read_points(args.points, args.columns)
     ks = args.ks
     with Progress(args.quiet) as progress:
@@ -202,10 +200,11 @@ def _calibrate(args: argparse.Namespace) -> int:
     from jaxfuzzy.calibrate import calibrate
     from jaxfuzzy.rig import save_rig
 
-    _check_file(args.out)
+    _check_file(args.out, *args.left, *args.right)
+    board = {"board": args.board, "square_m": args.square, "marker_m": args.marker, "dictionary": args.dictionary}
     with Progress(args.quiet) as progress:
         progress("looking for the board", 0.0)
-        rig = calibrate(args.left, args.right, board=args.board, square_m=args.square, marker_m=args.marker)
+        rig = calibrate(args.left, args.right, **board)
         save_rig(args.out, rig)
     if args.json:
         show(json.dumps(dataclasses.asdict(rig), allow_nan=False))
@@ -244,8 +243,10 @@ def _scene_lines(scene: "Scene", tree: dict[str, Any]) -> Iterator[str]:
         yield f"note on {', '.join(objects)}: {reason}"
 
 
-def _check_file(path: Path) -> None:
-    """Whether a file can be written, before a long computation."""
+def _check_file(path: Path, *inputs: Path) -> None:
+    """Whether a file can be written, and is none of those that are read, before a long computation."""
+    if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
+        raise ValueError(f"out must not be the input, got {path}")
     if path.is_dir():
         raise ValueError(f"out must be a file, got the folder {path}")
     if not path.parent.is_dir():

@@ -7,8 +7,8 @@ from jaxfuzzy import checks
 METHODS = ("sgbm", "hh", "bm")
 STEP = 16  # OpenCV searches a multiple of 16 disparities
 FURTHEST_PX = 2047  # disparities are int16, 16 a pixel
-# Semi-global costs are int16 as well: blocks of 13 colour pixels begin to overflow, of 15 a sixth of the answers is wrong; and so does
-# a price from 23,000 on (on the cones; 11,600 does no harm).
+# Semi-global costs are int16 as well: blocks of 13 colour pixels begin to overflow, with 15 a sixth of the answers is wrong; prices
+# do so from 23,000 on (on the cones; 11,600 does no harm).
 LARGEST_BLOCK, LARGEST_BLOCK_BM, HIGHEST_PRICE, CHANNELS = 11, 51, 16_383, 3
 
 

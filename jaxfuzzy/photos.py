@@ -198,7 +198,7 @@ def alignment(left: Image, right: Image) -> Alignment:
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_codes, right_codes)
     if len(pairs) < FEWEST_FEATURES:
         return UNKNOWN
-    ends = np.array([left_points[pair.queryIdx].pt + right_points[pair.trainIdx].pt for pair in pairs])
+    ends = np.array([[*left_points[pair.queryIdx].pt, *right_points[pair.trainIdx].pt] for pair in pairs])
     x, y, right_x, right_y = shrink * ends.T
     across, down = x - right_x, right_y - y
     where = np.stack([np.ones_like(x), 2 * x / left.shape[1] - 1, 2 * y / left.shape[0] - 1], axis=1)

@@ -91,11 +91,12 @@ def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, d
         ValueError: Shapes disagree, depths are whole numbers, or a standard deviation is not above 0.
         DataError: No pixel is left.
     """
-    if np.asarray(depth_m).dtype.kind in "iu":
+    values = np.asarray(depth_m)
+    if values.dtype.kind in "iu":
         raise ValueError(
-            f"depth_m must be in metres, got {np.asarray(depth_m).dtype}, which depth cameras give in millimetres: multiply by 0.001"
+            f"depth_m must be in metres, got {values.dtype}, which depth cameras give in millimetres: multiply by 0.001"
         )
-    depth = _map(np.asarray(depth_m), "depth_m", rig)
+    depth = _map(values, "depth_m", rig)
     known = np.isfinite(depth) & (depth > 0)
     valid = known if valid is None else _mask(valid, depth.shape) & known
     if depth_std is None:

@@ -80,6 +80,8 @@ class Rig:
         for name, positive in (("right_focal_px", True), ("right_center_px", False)):
             if getattr(self, name) is not None:
                 _set(self, name, _vector(getattr(self, name), name, 2, positive=positive))
+        if not isinstance(self.metric, bool | np.bool_):
+            raise ValueError(f"metric must be True or False, got {self.metric!r}")
         self._check_pose()
 
     def _check_pose(self) -> None:
@@ -87,6 +89,8 @@ class Rig:
             if len(self.distortion) != 2:
                 raise ValueError(f"distortion must be two lists, left and right, got {len(self.distortion)}")
             lenses = tuple(tuple(float(value) for value in np.ravel(lens)) for lens in self.distortion)
+            if not all(np.isfinite(lens).all() for lens in lenses):
+                raise ValueError(f"distortion must be finite, got {lenses}")
             if any(len(lens) not in (0, 4, 5, 8, 12, 14) for lens in lenses):
                 raise ValueError(
                     f"distortion must have 4, 5, 8, 12 or 14 coefficients, got {[len(lens) for lens in lenses]}"
@@ -99,7 +103,8 @@ class Rig:
                 raise ValueError("distortion must come with rotation and translation: such images are not rectified")
             return
         rotation = np.asarray(self.rotation, float)
-        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+        orthogonal = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        if not orthogonal or np.linalg.det(rotation) < 0:
             raise ValueError(f"rotation must be a 3 x 3 rotation matrix, got {rotation.tolist()}")
         _set(self, "rotation", tuple(tuple(row) for row in rotation.tolist()))
         translation = _vector(self.translation, "translation", 3)
@@ -191,10 +196,10 @@ def load_rig(
     Args:
         path: The file. Of ROS's two files the left one; of OpenCV's two the intrinsics.
         other: The second file of the same rig, where there are two.
-        unit_m: Length of the file's unit in metres. By default a millimetre for Middlebury and a metre for all others;
+        unit_m: Length of the file's unit in metres. By default a millimetre for Middlebury and a metre for all others, own JSON too;
             OpenCV's translation is in whatever unit the squares of the calibration board were given in.
         rectified: The images are rectified already although the file also describes the raw cameras.
-        cameras: Which two of KITTI's four; by default the colour pair (2, 3), else the grey one (0, 1).
+        cameras: Which two of KITTI's four, such as (0, 1); by default the colour pair (2, 3), else the grey one (0, 1).
         arbitrary_units: Where the baseline or offset is not in the file, go on with baseline 1 and offset 0; the rig
             then has `metric=False`, lengths mean nothing and an unknown offset bends shapes.
 
@@ -204,42 +209,31 @@ def load_rig(
     """
     text = _text(path)
     try:
+        unit = None if unit_m is None else _vector([unit_m], "unit_m", 1, positive=True)[0]
         if text.lstrip().startswith("{") and '"schema"' in text:
-            return _from_json(text)
-        second = None if other is None else _text(other)
-        fields = rigfiles.parse(text, second, cameras=cameras, rectified=rectified)
-        unit = fields.pop("unit_m", 1.0) if unit_m is None else _vector([unit_m], "unit_m", 1, positive=True)[0]
-        fields.pop("unit_m", None)
-        missing = [name for name in ("baseline_m", "doffs_px") if fields.get(name) is None]
-        if missing and not arbitrary_units:
-            words = " and no ".join(name.removesuffix("_m").removesuffix("_px") for name in missing)
-            raise ValueError(
-                f"holds no {words}, without which lengths in metres are unknown; arbitrary_units=True goes on without"
+            given = {"other": other is not None, "cameras": cameras is not None, "rectified": rectified}
+            if wrong := [name for name, is_given in given.items() if is_given]:
+                raise ValueError(f"is this library's own JSON, which says itself what {' and '.join(wrong)} would")
+            rig = _from_json(text, unit)
+        else:
+            second = None if other is None else _text(other)
+            rig = _from_fields(
+                rigfiles.parse(text, second, cameras=cameras, rectified=rectified), unit, arbitrary_units
             )
-        if "baseline_m" in missing:
-            fields["baseline_m"], unit = 1.0, 1.0
-        if "doffs_px" in missing:
-            fields["doffs_px"] = 0.0
-        if fields["baseline_m"] <= 0:
-            raise ValueError(
-                f"has the baseline {fields['baseline_m']}, which is not above 0: left and right are swapped, or the"
-                " transformation is the inverse"
-            )
-        fields["baseline_m"] *= unit
-        if fields.get("translation") is not None:
-            fields["translation"] = tuple(np.asarray(fields["translation"]) * unit)
-        rig = Rig(**fields, metric=not missing)
     except ValueError as error:
         raise ValueError(f"rig {os.fspath(path)} {one_line(error)}") from None
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"rig {os.fspath(path)} is damaged or no calibration file ({type(error).__name__})") from None
-    if rig.metric and not PLAUSIBLE_BASELINE_M[0] <= rig.baseline_m <= PLAUSIBLE_BASELINE_M[1]:
-        warnings.warn(
-            f"rig {os.fspath(path)} has a baseline of {rig.baseline_m:g} m: if the file's unit is not the metre,"
-            " say so, for instance unit_m=0.001",
-            stacklevel=2,
-        )
+    warn_of_unit(
+        rig, f"rig {os.fspath(path)}", "if the file's unit is not the metre, say so, for instance unit_m=0.001"
+    )
     return rig
+
+
+def warn_of_unit(rig: Rig, whose: str, advice: str) -> None:
+    """Warns where cameras are so near or far from each other that the unit must be another one."""
+    if rig.metric and not PLAUSIBLE_BASELINE_M[0] <= rig.baseline_m <= PLAUSIBLE_BASELINE_M[1]:
+        warnings.warn(f"{whose} has a baseline of {rig.baseline_m:g} m: {advice}", stacklevel=3)
 
 
 def save_rig(path: str | os.PathLike[str], rig: Rig) -> None:
@@ -253,7 +247,32 @@ def save_rig(path: str | os.PathLike[str], rig: Rig) -> None:
     write_atomic(path, (text + "\n").encode())
 
 
-def _from_json(text: str) -> Rig:
+def _from_fields(fields: rigfiles.Fields, unit: float | None, arbitrary_units: bool) -> Rig:
+    """The rig in metres, where the file's unit is another one or not the one that its format has."""
+    unit = fields.pop("unit_m", 1.0) if unit is None else unit
+    fields.pop("unit_m", None)
+    missing = [name for name in ("baseline_m", "doffs_px") if fields.get(name) is None]
+    if missing and not arbitrary_units:
+        words = " and no ".join(name.removesuffix("_m").removesuffix("_px") for name in missing)
+        raise ValueError(
+            f"holds no {words}, without which lengths in metres are unknown; arbitrary_units=True goes on without"
+        )
+    if "baseline_m" in missing:
+        fields["baseline_m"], unit = 1.0, 1.0
+    if "doffs_px" in missing:
+        fields["doffs_px"] = 0.0
+    if fields["baseline_m"] <= 0:
+        raise ValueError(
+            f"has the baseline {fields['baseline_m']}, which is not above 0: left and right are swapped, or the"
+            " transformation is the inverse"
+        )
+    fields["baseline_m"] *= unit
+    if fields.get("translation") is not None:
+        fields["translation"] = tuple(np.asarray(fields["translation"]) * unit)
+    return Rig(**fields, metric=not missing)
+
+
+def _from_json(text: str, unit: float | None) -> Rig:
     try:
         tree = json.loads(text)
     except json.JSONDecodeError as error:
@@ -273,7 +292,11 @@ def _from_json(text: str) -> Rig:
     if tree.get("calibration") is not None:
         entries = {name: _tuples(value) for name, value in tree["calibration"].items()}
         tree["calibration"] = Calibration(**entries)
-    return Rig(**tree)
+    rig = Rig(**tree)
+    if unit is None:
+        return rig
+    moved = None if rig.translation is None else tuple(np.asarray(rig.translation) * unit)
+    return dataclasses.replace(rig, baseline_m=rig.baseline_m * unit, translation=moved)
 
 
 def _tuples(value: Any) -> Any:
@@ -285,7 +308,7 @@ def _text(path: str | os.PathLike[str]) -> str:
     if len(data) > LARGEST_FILE:
         raise ValueError(f"rig {os.fspath(path)} has {len(data)} bytes, no calibration has more than {LARGEST_FILE}")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"rig {os.fspath(path)} is no text file, so no calibration") from None
 

@@ -38,9 +38,13 @@ def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rect
         return middlebury(text)
     if re.search(r"^P(0|2|_rect_00|_rect_02):\s+[-+.\d]", text, re.MULTILINE):
         return kitti(text, cameras)
+    if other is None and len(cameras_of := _documents(text)) == 2:
+        text, other = cameras_of
     tree = storage(text)
     other_tree = None if other is None else storage(other)
-    if "projection_matrix" in tree or {"P", "K"} <= tree.keys():
+    if other is None and isinstance(tree.get("left"), dict) and isinstance(tree.get("right"), dict):
+        tree, other_tree = tree["left"], tree["right"]
+    if _is_camera_info(tree):
         return ros(tree, other_tree, rectified=rectified)
     return opencv(tree | (other_tree or {}), rectified=rectified)
 
@@ -70,20 +74,27 @@ def middlebury(text: str) -> Fields:
 def kitti(text: str, cameras: tuple[int, int] | None) -> Fields:
     """KITTI `calib.txt` (P0 ... P3) or `calib_cam_to_cam.txt` (P_rect_00 ...): rectified pairs, metres."""
     entries = dict(re.findall(r"^[ \t]*(\w+):[ \t]*(.*\S)", text, re.MULTILINE))
-    matrices = {
-        int(number): np.reshape(_numbers(entries[name]), (3, 4))
+    projections = {
+        int(number): name
         for name in entries
         if (number := name.removeprefix("P_rect_0").removeprefix("P")) in {"0", "1", "2", "3"}
-        and len(_numbers(entries[name])) == 12
     }
     if cameras is None:
-        cameras = (2, 3) if {2, 3} <= matrices.keys() else (0, 1)
-    if not set(cameras) <= matrices.keys():
-        raise ValueError(f"holds projection matrices of 12 numbers for cameras {sorted(matrices)}, not for {cameras}")
+        cameras = (2, 3) if {2, 3} <= projections.keys() else (0, 1)
+    if len(cameras) != 2 or not set(cameras) <= projections.keys():
+        raise ValueError(f"holds the projection matrices of cameras {sorted(projections)}, not of {cameras}")
+    left, right = (_projection(entries[projections[camera]], projections[camera]) for camera in cameras)
     size = entries.get(f"S_rect_0{cameras[0]}")
-    fields = _projections(matrices[cameras[0]], matrices[cameras[1]])
+    fields = _projections(left, right)
     fields["image_size"] = None if size is None else tuple(int(value) for value in _numbers(size))
     return fields
+
+
+def _projection(text: str, name: str) -> np.ndarray:
+    words = text.split()
+    if len(words) != 12 or not all(NUMBER.fullmatch(word) for word in words):
+        raise ValueError(f"{name} must be 12 numbers, got {text!r}")
+    return np.reshape([float(word) for word in words], (3, 4))
 
 
 def opencv(tree: Fields, *, rectified: bool) -> Fields:
@@ -160,6 +171,24 @@ def storage(text: str) -> Fields:
     return _matrices(_yaml(text))
 
 
+def _documents(text: str) -> list[str]:
+    """The documents of a YAML file, each a mapping of its own; more than two are none of a pair of cameras."""
+    if text.lstrip().startswith(("<", "{")):
+        return [text]
+    documents = [
+        part
+        for part in re.split(r"^(?:---|\.\.\.).*$", text, flags=re.MULTILINE)
+        if re.search(r"^\s*\w+\s*:", part, re.MULTILINE)
+    ]
+    if len(documents) > 2:
+        raise ValueError(f"holds {len(documents)} documents; one or two are read, of one or two cameras")
+    return documents
+
+
+def _is_camera_info(tree: Fields) -> bool:
+    return "projection_matrix" in tree or {"P", "K"} <= tree.keys() or {"p", "k"} <= tree.keys()
+
+
 def _yaml(text: str) -> Fields:
     """The part of YAML that calibration files use: nested mappings, numbers, and lists in brackets or by dashes."""
     text = re.sub(r"^%.*$|^---.*$|\s#.*$|^\.\.\.$", "", text, flags=re.MULTILINE)
@@ -227,7 +256,7 @@ def _matrices(tree: Fields) -> Fields:
 
 
 def _camera_info(tree: Fields) -> Fields:
-    def matrix(names: tuple[str, str], rows: int, cols: int) -> np.ndarray:
+    def matrix(names: tuple[str, ...], rows: int, cols: int) -> np.ndarray:
         value = next((tree[name] for name in names if name in tree), None)
         if value is None or np.size(value) != rows * cols:
             raise ValueError(f"is a camera_info without a {rows} x {cols} {names[0]}")
@@ -235,10 +264,10 @@ def _camera_info(tree: Fields) -> Fields:
 
     width, height = (tree.get(f"image_{side}", tree.get(side)) for side in ("width", "height"))
     return {
-        "k": matrix(("camera_matrix", "K"), 3, 3),
-        "r": matrix(("rectification_matrix", "R"), 3, 3),
-        "p": matrix(("projection_matrix", "P"), 3, 4),
-        "d": np.ravel(np.asarray(tree.get("distortion_coefficients", tree.get("D", ())), float)),
+        "k": matrix(("camera_matrix", "K", "k"), 3, 3),
+        "r": matrix(("rectification_matrix", "R", "r"), 3, 3),
+        "p": matrix(("projection_matrix", "P", "p"), 3, 4),
+        "d": np.ravel(np.asarray(tree.get("distortion_coefficients", tree.get("D", tree.get("d", ()))), float)),
         "model": tree.get("distortion_model", ""),
         "size": None if width is None or height is None else (int(width), int(height)),
     }
@@ -269,6 +298,10 @@ def _reprojection(q: np.ndarray) -> Fields:
 
 
 def _raw(left: Any, left_lens: Any, right: Any, right_lens: Any, rotation: Any, translation: Any) -> Fields:
+    if abs(translation[0]) < max(abs(translation[1]), abs(translation[2])):
+        raise ValueError(
+            "has one camera above or before the other; only side by side is supported: turn the images by 90°"
+        )
     return {
         "focal_px": (left[0, 0], left[1, 1]),
         "center_px": (left[0, 2], left[1, 2]),

@@ -109,6 +109,16 @@ def test_charuco_seen_in_part():
         calibrate(lefts, rights, **options | {"dictionary": "5X5"})
     with pytest.raises(ValueError, match=r"marker_m must be below square_m, 0\.03"):
         calibrate(lefts, rights, **options | {"marker_m": 0.03})
+    with pytest.raises(
+        ValueError, match="dictionary must have the 60 markers of the board, got 'DICT_4X4_50', which has 50"
+    ):
+        calibrate(lefts, rights, **options | {"board": (11, 9), "dictionary": "DICT_4X4_50"})
+    # A pair of which one row of corners is seen holds no plane.
+    picture[118:] = 255
+    strip = pairs(picture, (8, 6), count=1)
+    found = calibrate(lefts + strip[0], rights + strip[1], **options).calibration
+    assert dict(found.left_out).keys() == {6}
+    assert "on one line" in found.left_out[0][1]
 
 
 def test_bad_pairs_are_named_and_left_out(odd_board):
@@ -122,9 +132,40 @@ def test_bad_pairs_are_named_and_left_out(odd_board):
     assert set(reasons) == {6, 7, 8, 9}
     assert reasons[6] == "board not found in the left image"
     assert reasons[7] == "board not found in the right image"
-    assert reasons[8] == "not 640 x 480 as the first image"
+    assert reasons[8] == "not 640 x 480 as most images"
     assert "otherwise" in reasons[9] or "reprojection" in reasons[9]
     assert found.rms_px < 0.1
+
+
+def test_the_first_photograph_may_be_the_bad_one(odd_board):
+    lefts, rights = odd_board
+    found = calibrate([lefts[0][:400], *lefts], [rights[0][:400], *rights], board=(7, 5), square_m=SQUARE).calibration
+    assert found.left_out == ((0, "not 640 x 480 as most images"),)
+    assert len(found.pairs) == 6
+
+
+def test_lists_out_of_step_are_no_pairs(odd_board):
+    """One dropped photograph, and every pair is of two moments: no rig explains them, whatever the error of each."""
+    lefts, rights = odd_board
+    with pytest.raises(
+        DataError, match=r"no two cameras explain these pairs: the corners are off by \d+ px; .*same order"
+    ):
+        calibrate(lefts, [*rights[1:], rights[0]], board=(7, 5), square_m=SQUARE)
+
+
+def test_one_camera_twice_and_one_pose_are_refused(odd_board):
+    lefts, rights = odd_board
+    with pytest.raises(ValueError, match=r"left_images\[0\] and right_images\[0\] are the same picture"):
+        calibrate(lefts, lefts, board=(7, 5), square_m=SQUARE)
+    with pytest.raises(DataError, match="the board faces the same way in every pair"):
+        calibrate(lefts[:1] * 4, rights[:1] * 4, board=(7, 5), square_m=SQUARE)
+    with pytest.raises(DataError, match=r"found in 1 of 1 pairs, 3 are needed$"):
+        calibrate(lefts[:1], rights[:1], board=(7, 5), square_m=SQUARE)
+
+
+def test_squares_in_millimetres_are_warned_of(odd_board):
+    with pytest.warns(UserWarning, match=r"baseline of 100\.\d+ m: square_m is the side of a square in metres"):
+        calibrate(*odd_board, board=(7, 5), square_m=1000 * SQUARE)
 
 
 def test_a_blunder_of_the_detector_is_left_out(odd_board, monkeypatch):

@@ -92,8 +92,13 @@ def test_kitti_colour_and_grey(tmp_path):
         "P_rect_00: 700 0 600 0 0 700 180 0 0 0 1 0\nP_rect_01: 700 0 600 -371 0 700 180 0 0 0 1 0\n"
     )
     assert_same(load_rig(put(tmp_path, raw)), Rig((700, 700), (600, 180), 0.53, (1242, 375)))
-    with pytest.raises(ValueError, match=r"for cameras \[0, 1\], not for \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"of cameras \[0, 1\], not of \(2, 3\)"):
         load_rig(put(tmp_path, raw), cameras=(2, 3))
+    # A damaged line is not passed over for the other pair of cameras.
+    for damaged in ("P3: 1 2 nan", "P3: 700 0 600 nan 0 700 180 0 0 0 1 0"):
+        text = "\n".join(damaged if line.startswith("P3") else line for line in KITTI.splitlines())
+        with pytest.raises(ValueError, match="P3 must be 12 numbers"):
+            load_rig(put(tmp_path, text))
 
 
 def write_storage(path, **entries):
@@ -189,6 +194,21 @@ def test_ros_camera_info(tmp_path):
     fisheye = put(tmp_path, camera_info("left", LEFT, LENS, r1, p1, "equidistant"), "fisheye.yaml")
     with pytest.raises(ValueError, match="distortion model 'equidistant'"):
         load_rig(fisheye, right)
+    # One file of both cameras: two documents, or one that names them; ROS 2 has its letters small.
+    both = put(tmp_path, left.read_text() + "---\n" + right.read_text(), "both.yaml")
+    small = [
+        path.read_text().replace("camera_matrix:", "k:").replace("distortion_coefficients:", "d:")
+        .replace("rectification_matrix:", "r:").replace("projection_matrix:", "p:").replace("image_", "")
+        for path in (left, right)
+    ]  # fmt: skip
+    echoed = [put(tmp_path, text, f"{i}.yaml") for i, text in enumerate(small)]
+    inside = "".join(
+        f"{name}:\n" + "".join(f"  {line}\n" for line in text.splitlines())
+        for name, text in zip(("left", "right"), small, strict=True)
+    )
+    for one in ((both,), echoed, (put(tmp_path, inside, "inside.yaml"),)):
+        assert_same(load_rig(*one), raw_rig(), rtol=1e-7)
+        assert_same(load_rig(*one, rectified=True), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +232,8 @@ def test_ros_camera_info(tmp_path):
             "3 x 4 but holds 2 numbers",
         ),
         ("%YAML:1.0\nwidth: 3\n", "neither M1"),
-        ("P0: 1 2 3\nP1: 1 2 3\n", "projection matrices of 12 numbers"),
+        ("P0: 1 2 3\nP1: 1 2 3\n", "P0 must be 12 numbers, got '1 2 3'"),
+        ("a: 1\n---\nb: 2\n---\nc: 3\n", "holds 3 documents"),
         (KITTI.replace("-315", "600"), "left and right are swapped"),
         (
             "P0: 700 0 600 0 0 700 180 0 0 0 1 0\nP1: 700 0 600 -1 0 700 180 -371 0 0 1 0\n",
@@ -245,6 +266,27 @@ def test_a_baseline_in_millimetres_is_noticed_and_can_be_told(tmp_path):
     assert load_rig(path, unit_m=0.001).baseline_m == pytest.approx(0.12, rel=1e-12)
 
 
+def test_the_unit_of_an_own_file_can_be_told_and_other_options_are_refused(tmp_path):
+    """A board whose squares were given in millimetres makes a rig in kilometres."""
+    pose = {"rotation": np.eye(3), "translation": (-120.0, 0, 0)}
+    save_rig(tmp_path / "rig.json", Rig(**GIVEN | {"baseline_m": 120.0} | pose))
+    with pytest.warns(UserWarning, match=r"baseline of 120 m.*unit_m=0\.001"):
+        load_rig(tmp_path / "rig.json")
+    rig = load_rig(tmp_path / "rig.json", unit_m=0.001)
+    assert rig.baseline_m == pytest.approx(0.12, rel=1e-12)
+    np.testing.assert_allclose(rig.translation, (-0.12, 0, 0), rtol=1e-12)
+    for options in ({"other": tmp_path / "rig.json"}, {"cameras": (0, 1)}, {"rectified": True}):
+        with pytest.raises(ValueError, match=f"own JSON, which says itself what {next(iter(options))} would"):
+            load_rig(tmp_path / "rig.json", **options)
+
+
+def test_a_mark_of_byte_order_does_no_harm(tmp_path):
+    """Windows editors write one before the text."""
+    path = tmp_path / "calib.txt"
+    path.write_bytes(b"\xef\xbb\xbf" + KITTI.encode())
+    assert_same(load_rig(path), load_rig(put(tmp_path, KITTI, "plain.txt")))
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -253,10 +295,16 @@ def test_a_baseline_in_millimetres_is_noticed_and_can_be_told(tmp_path):
         ({"baseline_m": -0.1}, "baseline_m must be finite and above 0"),
         ({"baseline_m": float("nan")}, "baseline_m must be finite"),
         ({"doffs_px": "x"}, "doffs_px must be 1 number"),
+        ({"metric": "false"}, "metric must be True or False, got 'false'"),
         ({"image_size": (640.5, 480)}, "whole numbers"),
         ({"rotation": np.eye(3)}, "rotation and translation must be given together"),
         ({"distortion": (LENS, LENS)}, "distortion must come with rotation"),
         ({"rotation": 2 * np.eye(3), "translation": (-0.12, 0, 0)}, "rotation must be a 3 x 3 rotation"),
+        ({"rotation": np.diag([1, 1, -1]), "translation": (-0.12, 0, 0)}, "rotation must be a 3 x 3 rotation"),
+        (
+            {"rotation": np.eye(3), "translation": (-0.12, 0, 0), "distortion": ((0, 0, 0, np.nan), LENS)},
+            "distortion must be finite",
+        ),
         ({"rotation": np.eye(3), "translation": (0.12, 0, 0)}, "left and right are swapped"),
         ({"rotation": np.eye(3), "translation": (0, -0.12, 0)}, "mainly along x"),
         ({"rotation": np.eye(3), "translation": (-0.2, 0, 0)}, "baseline_m must be the length"),

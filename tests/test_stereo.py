@@ -656,7 +656,7 @@ def test_multiples_of_pixels_and_millimetres_are_refused():
     for name, wrong in (("OpenCV", 16 * values), ("KITTI", (256 * values).astype(np.uint16))):
         with pytest.raises(ValueError, match=f"disparity_px must be in pixels, got .* in an image 4 wide.*{name}"):
             cloud_from_disparity(wrong, None, FLAT)
-    with pytest.raises(ValueError, match="depth_m must be in metres, got uint16.* multiply by 0.001"):
+    with pytest.raises(ValueError, match=r"depth_m must be in metres, got uint16.* multiply by 0\.001"):
         cloud_from_depth((1000 * values).astype(np.uint16), None, FLAT)
 
 
