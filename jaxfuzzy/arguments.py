@@ -37,7 +37,8 @@ MODEL = """examples:
   jaxfuzzy model left.png right.png --rig rig.json --json --quiet | jq '.shapes[].kind'"""
 SHAPES = """examples:
   jaxfuzzy shapes cloud.ply
-  jaxfuzzy shapes scan.pcd --up 0,0,1 --no-ground --out found"""
+  jaxfuzzy shapes scan.pcd --up 0,0,1 --no-ground --out found
+  jaxfuzzy shapes merged.ply --up 0,0,1 --camera none"""
 CLUSTER = """examples:
   jaxfuzzy cluster points.csv -k 3 --out labels.csv
   jaxfuzzy cluster points.csv -k 2:5 --sizes            tries 2, 3, 4 and 5
@@ -124,6 +125,12 @@ def _shapes(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("cloud", type=Path, metavar="CLOUD", help="PLY, PCD, NPY, NPZ, CSV or XYZ, in metres")
     add("--up", type=_or_auto(_direction), metavar="X,Y,Z", help="the vertical direction, or auto (default)")
+    add(
+        "--camera",
+        type=_camera,
+        metavar="X,Y,Z",
+        help="where the points were seen from, or none if that is not known (default: 0,0,0)",
+    )
     add("--no-ground", action="store_true", help="there is no table to find and remove; needs --up")
     _scene(command)
 
@@ -212,11 +219,22 @@ def _length(text: str) -> float:
     return value
 
 
-def _direction(text: str) -> tuple[float, ...]:
+def _place(text: str) -> tuple[float, ...]:
     try:
-        found = tuple(float(word) for word in text.split(","))
+        return tuple(float(word) for word in text.split(","))
     except ValueError:
-        found = ()
+        return ()
+
+
+def _camera(text: str) -> tuple[float, ...] | str:
+    found = _place(text)
+    if text != "none" and len(found) != 3:
+        raise argparse.ArgumentTypeError(f"must be three numbers such as 0,0,1.5, or none, got {text!r}")
+    return found or text
+
+
+def _direction(text: str) -> tuple[float, ...]:
+    found = _place(text)
     if len(found) != 3 or not any(found):
         raise argparse.ArgumentTypeError(f"must be three numbers such as 0,-1,0, not all 0, got {text!r}")
     return found

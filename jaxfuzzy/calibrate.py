@@ -190,7 +190,7 @@ def _views(
     sizes: dict[int, tuple[tuple[int, int], ...]] = {}
     for pair, (left_image, right_image) in enumerate(zip(left_images, right_images, strict=True)):
         images = [read_grey(left_image, f"left_images[{pair}]"), read_grey(right_image, f"right_images[{pair}]")]
-        if np.array_equal(*images) and np.ptp(images[0]):
+        if np.array_equal(images[0], images[1]) and np.ptp(images[0]):
             raise ValueError(f"left_images[{pair}] and right_images[{pair}] are the same picture: give both cameras'")
         sizes[pair] = tuple((image.shape[1], image.shape[0]) for image in images)
         found = [find(image) for image in images]

@@ -99,6 +99,8 @@ def _scene(args: argparse.Namespace, model: Callable[..., "Scene"]) -> int:
     options = {name: getattr(args, name) for name in names if getattr(args, name, None) is not None}
     if getattr(args, "no_ground", False):
         options["ground"] = None
+    if options.get("camera") == "none":
+        options["camera"] = None
     with Progress(args.quiet) as progress:
         scene = model(progress=lambda stage, share: progress(stage, share * (1 - WRITING)), **options)
         if not scene.shapes:

@@ -1,6 +1,7 @@
 """The point cloud: its record, and reading and writing it."""
 
 import os
+import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,8 @@ from jaxfuzzy.files import one_line, read_bytes, write_atomic
 
 SUFFIXES = (".ply", ".pcd", ".npy", ".npz", ".csv", ".xyz", ".txt")
 BESIDE = ("depth_std", "column_px", "row_px")
+# Of colors between 0 and 1: more than rounding.
+COLOR_SLACK = 0.01
 COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
@@ -41,7 +44,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """Reads a point cloud: PLY, PCD, NPY, NPZ, CSV or XYZ, told apart by content. Nothing is unpickled.
 
     Coordinates are taken as they are, in metres. Points that are not finite, or whose depth deviation or pixel is not, are
-    left out, and a warning says how many.
+    left out, and a warning says how many; another one tells a viewpoint other than the origin, which PCD files may have.
     What a file holds beside coordinates, colors and what `write_cloud` adds (normals, labels, ...) is passed over.
 
     Raises:
@@ -49,7 +52,10 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         ValueError: It is in none of these formats, damaged, cut short, or holds no finite point.
     """
     try:
-        columns = cloudfiles.parse(read_bytes(path, "cloud"))
+        data = read_bytes(path, "cloud")
+        columns = cloudfiles.parse(data)
+        # Some write their names in capitals.
+        columns = {name.lower(): values for name, values in columns.items() if name != name.lower()} | columns
         if missing := [name for name in "xyz" if name not in columns]:
             raise ValueError(f"has no column {', '.join(missing)}, only {', '.join(columns)}")
         points = np.stack([columns[name] for name in "xyz"], axis=1)
@@ -66,6 +72,13 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     if not finite.all():
         warnings.warn(
             f"cloud {os.fspath(path)}: {int((~finite).sum())} of {len(points)} points are not finite and were left out",
+            stacklevel=2,
+        )
+
+    if (place := cloudfiles.viewpoint(data)) is not None:
+        warnings.warn(
+            f"cloud {os.fspath(path)} was seen from {place} by its own word: unless points are in the camera's frame, give that"
+            " as camera",
             stacklevel=2,
         )
 
@@ -95,7 +108,8 @@ def write_cloud(
         ascii: Write PLY and PCD as text.
 
     Raises:
-        ValueError: The suffix is none of these, or a column has another length.
+        ValueError: The suffix is none of these, colors are not 0..1, or a column has another length, a number too large, or a name
+            that the cloud has itself or that no file can have.
         OSError: The file cannot be written.
     """
     suffix = Path(path).suffix.lower()
@@ -107,6 +121,8 @@ def write_cloud(
     arrays = {"points": points}
     columns: cloudfiles.Columns = dict(zip("xyz", points.T, strict=True))
     if cloud.colors is not None:
+        if not np.all((np.asarray(cloud.colors) >= -COLOR_SLACK) & (np.asarray(cloud.colors) <= 1 + COLOR_SLACK)):
+            raise ValueError(f"cloud.colors must be 0 to 1, got up to {np.max(cloud.colors):g}")
         arrays["colors"] = np.rint(np.clip(np.asarray(cloud.colors), 0, 1) * 255).astype(np.uint8)
         columns |= dict(zip(COLORS[0], arrays["colors"].T, strict=True))
     if cloud.depth_std is not None:
@@ -115,6 +131,8 @@ def write_cloud(
         arrays["pixels_px"] = np.asarray(cloud.pixels_px)
         columns |= dict(zip(("column_px", "row_px"), arrays["pixels_px"].T, strict=True))
     for name, values in (extra or {}).items():
+        if name in columns or name in arrays or not re.fullmatch(r"[A-Za-z_]\w*", name):
+            raise ValueError(f"extra must have names of letters that the cloud has not itself, got {name!r}")
         arrays[name] = columns[name] = np.asarray(values)
     for name, values in columns.items():
         columns[name] = _writable(name, values, len(points))
@@ -139,7 +157,10 @@ def _writable(name: str, values: np.ndarray, count: int) -> np.ndarray:
     if values.dtype == bool:
         return values.astype(np.uint8)
     if values.dtype.kind in "iu" and values.dtype.itemsize == 8:
-        return values.astype(np.int32)
+        whole = values.astype(np.int32)
+        if not np.array_equal(whole, values):
+            raise ValueError(f"column {name} must hold whole numbers of 32 bits, got up to {np.abs(values).max()}")
+        return whole
     return values.astype(np.float32) if values.dtype.itemsize == 2 and values.dtype.kind == "f" else values
 
 

@@ -4,6 +4,7 @@ A file is whole or refused: what its header promises is compared with what is th
 """
 
 import io
+import re
 
 import numpy as np
 
@@ -29,11 +30,12 @@ def parse(data: bytes) -> Columns:
     Raises:
         ValueError: It is none of the known formats, damaged or cut short.
     """
+    data = data.removeprefix(b"\xef\xbb\xbf")  # editors on Windows mark the order of bytes before the text
     if data.startswith(b"ply"):
         return parse_ply(data)
     if data.startswith(b"\x93NUMPY") or data.startswith(b"PK"):
         return parse_numpy(data)
-    if data.startswith((b"# .PCD", b"VERSION", b"FIELDS")):
+    if re.match(rb"(\s*#[^\n]*\n)*\s*(VERSION|FIELDS)\s", data[:LONGEST_HEADER]):
         return parse_pcd(data)
     return parse_text(data)
 
@@ -72,7 +74,7 @@ def parse_ply(data: bytes) -> Columns:
                 if table.shape[1] != len(names):
                     raise ValueError(f"has {table.shape[1]} numbers a vertex where the header says {len(names)}")
                 kinds = [PLY_TYPES[words[0]] for words in properties]
-                return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(zip(names, kinds, strict=True))}
+                return _typed(table, list(zip(names, kinds, strict=True)))
             kinds = [PLY_FORMATS[order] + PLY_TYPES[words[0]] for words in properties]
             return _records(body[at:], list(zip(names, kinds, strict=True)), count, exact=last)
         at += count if order == "ascii" else _ply_element_size(body[at:], count, properties, PLY_FORMATS[order])
@@ -138,18 +140,27 @@ def parse_pcd(data: bytes) -> Columns:
             raise ValueError(f"says {times} numbers for the field {field!r} of every point")
         kinds += [(f"{field}{'' if times == 1 else f'_{i}'}", f"<{PCD_TYPES[type_]}{size}") for i in range(times)]
     kinds = list(zip(_unique([name for name, _ in kinds]), [kind for _, kind in kinds], strict=True))
-    layout = entries["DATA"][0]
+    layout = entries["DATA"][0].lower()
     if layout == "ascii":
         rows = [row for row in body.decode("ascii", "replace").split("\n") if row.strip()]
         table = _table(rows, None, count, exact=True)
         if table.shape[1] != len(kinds):
             raise ValueError(f"has {table.shape[1]} numbers a point where the header says {len(kinds)}")
-        return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(kinds)}
+        return _typed(table, kinds)
     if layout == "binary":
         return _records(body, kinds, count, exact=False)  # PCL pads the file to a whole page
     if layout == "binary_compressed":
         return _pcd_compressed(body, kinds, count)
     raise ValueError(f"has DATA {layout!r}; known are ascii, binary and binary_compressed")
+
+
+def viewpoint(data: bytes) -> tuple[float, ...] | None:
+    """Where a PCD file says its points were seen from; None where that is the origin, or is not said."""
+    found = re.search(rb"^VIEWPOINT[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", data[:LONGEST_HEADER], re.MULTILINE)
+    if found is None or not all(_is_number(word.decode("ascii", "replace")) for word in found.groups()):
+        return None
+    place = tuple(float(word) for word in found.groups())
+    return place if any(place) else None
 
 
 def _pcd_compressed(body: bytes, kinds: list[tuple[str, str]], count: int) -> Columns:
@@ -236,7 +247,8 @@ def parse_numpy(data: bytes) -> Columns:
 def parse_text(data: bytes) -> Columns:
     """Rows of numbers separated by commas, semicolons or blanks, with or without a line of names; # starts a comment.
 
-    Without names the first three are x, y, z; three further columns of whole numbers 0..255 are a color.
+    Without names the first three are x, y, z; three further columns of whole numbers 0..255 are a color. CloudCompare puts //
+    before its names, and how many points follow after them.
     """
     if b"\0" in data[:LONGEST_HEADER]:
         raise ValueError("is in no known format (PLY, PCD, NPY, NPZ, CSV, XYZ)")
@@ -258,6 +270,10 @@ def parse_text(data: bytes) -> Columns:
         if table.shape[1] == 6 and np.all((rest >= 0) & (rest <= 255) & (rest == np.round(rest))) and rest.max() > 1:
             columns |= dict(zip(("red", "green", "blue"), rest.T.astype(np.uint8), strict=True))
         return columns
+    names[0] = names[0].removeprefix("//").strip()
+    names = [name for name in names if name]
+    if len(rows) > 2 and len(names) > 1 and rows[1].isdecimal():
+        del rows[1]
     if len(rows) < 2:
         raise ValueError("holds no points, or is in no known format (PLY, PCD, NPY, NPZ, CSV, XYZ)")
     table = _table(rows[1:], delimiter, len(rows) - 1, exact=True)
@@ -362,6 +378,18 @@ def _table(rows: list[str], delimiter: str | None, count: int, *, exact: bool) -
         return np.loadtxt(rows[:count], delimiter=delimiter, ndmin=2, comments=None)
     except ValueError as error:
         raise ValueError(f"has a row that is not numbers ({str(error).splitlines()[0]})") from None
+
+
+def _typed(table: np.ndarray, kinds: list[tuple[str, str]]) -> Columns:
+    """The columns of a table of text, each as the type its header says."""
+    columns = {}
+    for values, (name, kind) in zip(table.T, kinds, strict=True):
+        whole = np.dtype(kind).kind != "f"
+        with np.errstate(invalid="ignore"):
+            columns[name] = values.astype(kind)
+        if whole and not np.array_equal(columns[name], values):
+            raise ValueError(f"has a {name} that is no {np.dtype(kind)}, as its header says")
+    return columns
 
 
 def _count(word: str, what: str) -> int:

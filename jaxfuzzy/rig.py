@@ -196,7 +196,7 @@ def load_rig(
     Args:
         path: The file. Of ROS's two files the left one; of OpenCV's two the intrinsics.
         other: The second file of the same rig, where there are two.
-        unit_m: Length of the file's unit in metres. By default a millimetre for Middlebury and a metre for all others, own JSON too;
+        unit_m: Length of the file's unit in metres. By default a millimetre for Middlebury and a metre for all others;
             OpenCV's translation is in whatever unit the squares of the calibration board were given in.
         rectified: The images are rectified already although the file also describes the raw cameras.
         cameras: Which two of KITTI's four, such as (0, 1); by default the colour pair (2, 3), else the grey one (0, 1).
@@ -208,6 +208,8 @@ def load_rig(
         ValueError: It is not a rig's file, or does not hold what metres need.
     """
     text = _text(path)
+    if cameras is not None and np.shape(cameras) != (2,):
+        raise TypeError(f"cameras must be two numbers such as (0, 1), got {cameras!r}")
     try:
         unit = None if unit_m is None else _vector([unit_m], "unit_m", 1, positive=True)[0]
         if text.lstrip().startswith("{") and '"schema"' in text:

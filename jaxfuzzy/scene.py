@@ -19,7 +19,7 @@ from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher
-from jaxfuzzy.objects import OF_SCENE
+from jaxfuzzy.objects import OF_SCENE, PIXELS_PER_POINT
 from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.photos import read_pair, rectify
@@ -42,6 +42,8 @@ KNOWN_TILT = 0.15
 FEWEST_POINTS = 50
 # A group that rises above the ground by no more than this share of the highest one's height is part of the ground.
 FLAT = 0.05
+# Without such groups the rest is divided anew, and may have such groups again; so many times.
+MOST_SWEPT = 3
 SEGMENT_OPTIONS = ("ks",)
 SHAPE_OPTIONS = ("kinds", "distance")
 # One word for both choices: how objects are counted, and how shapes are named.
@@ -196,15 +198,27 @@ def _model(
     weights: Any = None,
     **options: Any,
 ) -> Scene:
+    if not isinstance(cloud, Cloud):
+        raise TypeError(
+            f"cloud must be a Cloud, got {type(cloud).__name__}; Cloud(points) makes one, read_cloud reads one"
+        )
     # Picked from on the host: each number of points picked in JAX would compile and keep a program of its own.
     points = np.asarray(checks.places(cloud.points, "cloud.points"))
     count = points.shape[0]
     vertical = CAMERA_UP if isinstance(up, str) else checks.direction(up, "up")
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
+    if isinstance(noise_distance, str):
+        checks.choice(noise_distance, "noise_distance", ("auto",))
+    elif checks.noise_distance(noise_distance, count) is None:
+        raise ValueError("noise_distance must be 'auto' or above 0, got None")
+    if cloud.pixels_px is not None and cloud.pixels_px.shape != (count, 2):
+        raise ValueError(f"cloud.pixels_px must have shape ({count}, 2), got {cloud.pixels_px.shape}")
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
     thickness, flat, found = 0.0, np.zeros(count, bool), None
     kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
+    # Of pixels, of which neighbours err alike, so many tell as much as one independent point.
+    smallest = 1 if cloud.pixels_px is None or rule == "paper" else PIXELS_PER_POINT
     along_ray = camera is not None and options.get("distance", "ray") == "ray"
     with compiling_ahead(OF_SCENE, points.dtype, along_ray):
         with clock.stage("ground"):
@@ -235,11 +249,12 @@ def _model(
                 )
             picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
             parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
-            if plane is not None:
-                raised = _standing(points[own], np.asarray(parts.labels), plane)
-                if not raised.all():
-                    own = own[raised]
-                    parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
+            for _ in range(MOST_SWEPT):
+                kept_of = _standing(points[own], np.asarray(parts.labels), plane, smallest)
+                if kept_of.all() or kept_of.sum() < FEWEST_POINTS:
+                    break
+                own = own[kept_of]
+                parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
     with clock.stage("shapes"):
         picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
         places, eye = points[own], None if camera is None else np.asarray(camera)
@@ -332,16 +347,20 @@ def load_scene(folder: str | Path) -> Scene:
     return report.load(folder)
 
 
-def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane) -> np.ndarray:
-    """Which points belong to no group that lies flat on the ground.
+def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane | None, smallest: int) -> np.ndarray:
+    """Which points belong to no group that lies flat on the ground or has fewer points than say anything.
 
     Matching errs by more than its noise over wide smooth surfaces, so patches of the table may float above their own noise. What
-    nowhere rises above the ground by more than a share of the highest object's height is such a patch, not an object.
+    nowhere rises above the ground by more than a share of the highest object's height is such a patch, not an object. So is what
+    has less than one independent point: a speck left of a wall.
     """
-    height = (points - np.asarray(ground.point)) @ np.asarray(ground.normal)
-    rises = [np.quantile(height[labels == k], 0.95) for k in range(labels.max() + 1)]
-    flat = np.flatnonzero(np.array(rises) < FLAT * max(rises, default=0.0))
-    return ~np.isin(labels, flat)
+    groups = range(int(labels.max(initial=-1)) + 1)
+    gone = [k for k in groups if (labels == k).sum() < smallest]
+    if ground is not None:
+        height = (points - np.asarray(ground.point)) @ np.asarray(ground.normal)
+        rises = [np.quantile(height[labels == k], 0.95) for k in groups]
+        gone += [k for k in groups if rises[k] < FLAT * max(rises)]
+    return ~np.isin(labels, gone)
 
 
 def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:

@@ -278,6 +278,8 @@ def _candidates(ks: Any, rule: str, count: int) -> tuple[int, ...]:
         checks.choice(ks, "ks", ("auto",))
         low, high = (2, 5) if rule == "paper" else (1, MOST)
         return tuple(range(low, min(high, count) + 1)) or (low,)
+    if not isinstance(ks, Iterable):
+        raise TypeError(f"ks must be 'auto' or several numbers such as (3,), got {ks!r}")
     wanted = [checks.integer(k, "ks", at_least=1, at_most=count, why=" (the number of points)") for k in ks]
     if not wanted or len(set(wanted)) < len(wanted):
         raise ValueError(f"ks must hold at least one number and none twice, got {tuple(wanted)}")

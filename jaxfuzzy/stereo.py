@@ -50,7 +50,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
         ValueError: An image cannot be used or sizes disagree.
         DataError: Fewer than 50 pixels were matched, or left and right are swapped or one and the same.
     """
-    matcher = Matcher() if matcher is None else matcher
+    matcher = _settings(matcher)
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         left, right, rig = rectify(left, right, rig)
@@ -88,12 +88,18 @@ def disparity(
         ValueError: An image cannot be used, sizes disagree, the rig is not rectified or the image is too narrow.
         DataError: Left and right are swapped or one and the same.
     """
-    matcher = Matcher() if matcher is None else matcher
+    matcher = _settings(matcher)
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
     _checked(left, right, matcher)
     return _matched(left, right, rig, matcher)
+
+
+def _settings(matcher: Matcher | None) -> Matcher:
+    if not isinstance(matcher, Matcher | None):
+        raise TypeError(f"matcher must be a Matcher, got {matcher!r}; Matcher(method=...) says how to match")
+    return Matcher() if matcher is None else matcher
 
 
 def _checked(left: Image, right: Image, matcher: Matcher) -> Alignment:

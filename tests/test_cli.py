@@ -103,6 +103,9 @@ def test_options_reach_the_pipeline(run, modelled):
         "ks": (1, 2, 3), "noise_distance": 0.01, "kinds": ("box", "cone"), "up": (0.0, 0.0, 1.0), "ground": None,
         "rule": "paper",
     }  # fmt: skip
+    for camera, place in (("none", None), ("1,2,3.5", (1.0, 2.0, 3.5)), ("0,0,0", (0.0, 0.0, 0.0))):
+        assert run("shapes", "cloud.xyz", "--camera", camera)[0] == 0
+        assert modelled["options"] == {"camera": place}
     assert run("shapes", "cloud.xyz", "-k", "auto", "--up", "auto", "--noise-distance", "auto")[0] == 0
     assert modelled["options"] == {"ks": "auto", "noise_distance": "auto", "up": "auto"}
 
@@ -254,6 +257,7 @@ def test_bad_clouds(run, tmp_path):
         (("objects.npy",), 2, "holds Python objects"),
         (("few.xyz", "--up", "0,0,0"), 2, "must be three numbers such as 0,-1,0, not all 0, got '0,0,0'"),
         (("few.xyz", "--no-ground"), 2, "up must be given"),
+        (("few.xyz", "--camera", "1,2"), 2, "must be three numbers such as 0,0,1.5, or none, got '1,2'"),
         (("few.xyz", "--up", "0,1,0", "--no-ground"), 1, "9 of 9 points"),
     ):
         found, out, err = run("shapes", *words)
@@ -391,6 +395,16 @@ def test_calibrate(run, shared_data):
     status, out, err = run("calibrate", *left, "--right", *right, "--square", "0.025", "--json", "--quiet")
     assert (status, err) == (0, "")
     assert json.loads(out)["image_size"] == [640, 480]
+
+
+def test_no_photograph_is_overwritten(run, tmp_path):
+    pictures()
+    before = Path("left.png").read_bytes()
+    words = ("left.png", "--right", "right.png", "--square", "0.02", "--out", "left.png")
+    status, _, err = run("calibrate", *words)
+    assert status == 2
+    assert "out must not be the input, got left.png" in last_line(err)
+    assert Path("left.png").read_bytes() == before
 
 
 def test_bad_calibration(run, tmp_path):

@@ -193,6 +193,11 @@ def test_compressed_points_unpack_to_what_they_were(parts):
     assert b"".join(columns[name].tobytes() for name in "xyz") == text
 
 
+PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+PLY_TEXT = PLY.format(2) + "1 2 3\n4 5 6\n"
+PCD_TEXT = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n"
+
+
 @pytest.mark.parametrize(
     ("name", "text", "colored"),
     [
@@ -202,6 +207,10 @@ def test_compressed_points_unpack_to_what_they_were(parts):
         ("colors.xyz", "1 2 3 255 0 0\n4 5 6 0 0 255\n", True),
         ("normals.xyz", "1 2 3 0.5 0 0\n4 5 6 0 -1 0\n", False),
         ("counted.pts", "2\n1 2 3\n4 5 6\n", False),
+        ("marked.csv", "\ufeffx,y,z\r\n1,2,3\r\n4,5,6\r\n", False),
+        ("cloudcompare.txt", "//X Y Z R G B\n2\n1 2 3 255 0 0\n4 5 6 0 0 255\n", True),
+        ("capitals.ply", PLY_TEXT.replace("float x", "float X").replace("float z", "float Z"), False),
+        ("comments.pcd", "#.PCD v.7\n# by hand\n" + PCD_TEXT.replace("ascii", "ASCII"), False),
     ],
 )
 def test_text(tmp_path, name, text, colored):
@@ -210,6 +219,12 @@ def test_text(tmp_path, name, text, colored):
     assert (back.colors is not None) == colored
     if colored:
         np.testing.assert_array_equal(back.colors, [[1, 0, 0], [0, 0, 1]])
+
+
+def test_a_viewpoint_elsewhere_is_told(tmp_path):
+    text = PCD_TEXT.replace("POINTS", "VIEWPOINT 2 3 1.5 1 0 0 0\nPOINTS")
+    with pytest.warns(UserWarning, match=r"seen from \(2\.0, 3\.0, 1\.5\) by its own word.*give that as camera"):
+        read_cloud(put(tmp_path, "a.pcd", text))
 
 
 def test_numpy_maps_and_records(tmp_path):
@@ -236,7 +251,6 @@ def lying_npy():
     return npy(np.zeros((4, 3))).replace(b"(4, 3)", b"(9, 3)")
 
 
-PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 BINARY = PLY.replace("ascii", "binary_little_endian")
 PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n"
 
@@ -257,6 +271,10 @@ PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\
         (PLY.format(3) + "1 2 3\n4 5 6\n", "3 points are promised, there are 2"),
         (PLY.format(1) + "1 2 3\n4 5 6\n", "2 points where 1 are promised"),
         (PLY.format(1) + "1 2\n", "2 numbers a vertex where the header says 3"),
+        (
+            PLY.format(1).replace("end_header", "property uchar red\nend_header") + "1 2 3 300\n",
+            "a red that is no uint8, as its header says",
+        ),
         (PLY.format(-1) + "1 2 3\n", "'-1' where element vertex"),
         (PLY.format(0), "no points"),
         (PLY.format("ten"), "'ten' where element vertex"),
@@ -324,6 +342,13 @@ def test_wrong_use(tmp_path):
         write_cloud(tmp_path / "cloud.obj", full_cloud())
     with pytest.raises(ValueError, match="column object must hold 3 numbers"):
         write_cloud(tmp_path / "cloud.ply", full_cloud(), extra={"object": np.zeros(2)})
+    for name in ("x", "colors", "my id", ""):
+        with pytest.raises(ValueError, match=f"extra must have names .* got '{name}'"):
+            write_cloud(tmp_path / "cloud.npz", full_cloud(), extra={name: np.zeros(3)})
+    with pytest.raises(ValueError, match="column id must hold whole numbers of 32 bits, got up to 1099511627783"):
+        write_cloud(tmp_path / "cloud.ply", full_cloud(), extra={"id": np.array([1, 2, 2**40 + 7])})
+    with pytest.raises(ValueError, match="colors must be 0 to 1, got up to 255"):
+        write_cloud(tmp_path / "cloud.ply", Cloud(POINTS, COLORS))
     with pytest.raises(OSError, match="cannot write"):
         write_cloud(tmp_path / "no" / "cloud.ply", full_cloud())
     assert list(tmp_path.iterdir()) == [], "something half-written was left behind"

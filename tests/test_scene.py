@@ -134,12 +134,40 @@ def test_progress_is_told_in_order(paper_pair):
         ({"rule": "best"}, ValueError, "rule"),
         ({"colour": 1}, TypeError, "colour"),
         ({"noise_distance": -1.0}, ValueError, "noise_distance"),
+        ({"noise_distance": "foo"}, ValueError, "noise_distance must be one of 'auto', got 'foo'"),
+        ({"noise_distance": None}, ValueError, "noise_distance must be 'auto' or above 0"),
+        (
+            {"noise_distance": np.ones(199)},
+            ValueError,
+            r"noise_distance must have shape \(\) or \(200,\), got \(199,\)",
+        ),
+        ({"ks": 3}, TypeError, r"ks must be 'auto' or several numbers such as \(3,\), got 3"),
     ],
 )
 def test_wrong_options_are_named(options, error, word):
     points = np.random.default_rng(0).normal(size=(200, 3)) + [0, 0, 5]
     with pytest.raises(error, match=word):
         model_cloud(Cloud(points), **({"ground": None, "up": (0, 1, 0)} | options))
+
+
+@pytest.mark.parametrize(("tilt", "seed"), [(6, 1), (11, 0), (18, 1), (26, 1)])
+def test_specks_of_table_and_wall_are_no_objects(tilt, seed):
+    """Of a wall that is taken away some 30 to 100 pixels stay, and would be objects; so would specks of the table."""
+    picture = render_pair(paper_scene(np.deg2rad(tilt)), seed=seed)
+    scene = model_scene(picture.left, picture.right, picture.rig)
+    assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
+
+
+def test_arguments_of_another_kind_are_named(paper_pair):
+    points = np.random.default_rng(0).normal(size=(200, 3)) + [0, 0, 5]
+    with pytest.raises(TypeError, match=r"cloud must be a Cloud, got ndarray; Cloud\(points\) makes one"):
+        model_cloud(points)
+    with pytest.raises(TypeError, match="rig must be a Rig, got str; load_rig reads one"):
+        model_scene(paper_pair.left, paper_pair.right, "calib.txt")
+    with pytest.raises(TypeError, match="matcher must be a Matcher, got 'sgbm'"):
+        model_scene(paper_pair.left, paper_pair.right, paper_pair.rig, matcher="sgbm")
+    with pytest.raises(ValueError, match=r"cloud.pixels_px must have shape \(200, 2\), got \(5, 2\)"):
+        model_cloud(Cloud(points, pixels_px=np.zeros((5, 2))))
 
 
 def test_bad_pairs_are_refused_with_one_clear_line(paper_pair, tmp_path):
