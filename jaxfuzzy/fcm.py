@@ -231,7 +231,8 @@ def _fit(
     )
     if not memberships:
         return partition
-    return _with_memberships(partition, *_memberships(tiles, theta, m, squared_noise, mask))
+    used = jnp.ones(points.shape[0], bool) if weights is None else weights > 0
+    return _with_memberships(partition, *_memberships(tiles, theta, m, squared_noise, mask), used)
 
 
 def _fit_blocks(
@@ -338,9 +339,11 @@ def _unit_scatter_block(
     return unit_scatter(theta, (tiles, m, squared_noise, None), shift)
 
 
-def _with_memberships(partition: Partition, u: Float[Array, "N K"], noise: Float[Array, " N"]) -> Partition:
+def _with_memberships(
+    partition: Partition, u: Float[Array, "N K"], noise: Float[Array, " N"], used: Bool[Array, " N"]
+) -> Partition:
     labels = jnp.where(noise > u.max(axis=1), -1, u.argmax(axis=1)).astype(jnp.int32)
-    all_noise = jnp.where((labels < 0).all(), int(Status.ALL_NOISE), 0)
+    all_noise = jnp.where(((labels < 0) | ~used).all(), int(Status.ALL_NOISE), 0)
     return Partition(
         partition.centers,
         partition.sizes,

@@ -58,8 +58,12 @@ def weighted_moments(
 def weighted_range(values: Float[Array, " N"], weights: Float[Array, " N"], tail: float = 0.02) -> Float[Array, "2"]:
     """Where evenly spread values begin and end: two quantiles, stretched by the share that lies beyond them.
 
-    A few values far out move the ends no further than by as many places in the order of the others.
+    A few values far out move the ends no further than by as many places in the order of the others; values of weight 0, wherever
+    they are, do not move them at all.
     """
+    # Beyond the last value there must be no other, or the ends of few values would lead towards it.
+    last = jnp.max(jnp.where(weights > 0, values, -jnp.inf))
+    values = jnp.where(weights > 0, values, jnp.where(last > -jnp.inf, last, values))
     order = jnp.argsort(values)
     heap = jnp.cumsum(weights[order]) - weights[order] / 2
     heap = divide(heap, weights.sum(), 0.5)

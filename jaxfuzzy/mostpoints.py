@@ -89,7 +89,7 @@ def most_points(
     chosen = best[0]
     status = Status(int(fits[chosen].status)) | (Status.PAPER_TIE if len(best) > 1 else Status(0))
     for kind in (k for k in SPACES[chosen] if k in kinds):
-        primitive = recover(fits[chosen], kind, points=padded)
+        primitive = recover(fits[chosen], kind, points=padded, weights=weight)
         if not isinstance(primitive, Quadric):
             break
     else:

@@ -39,7 +39,12 @@ KINDS = ("plane", "box", "cylinder", "sphere", "cone", "quadric")
 
 
 def recover(
-    varieties: Varieties, kind: str, *, variety: int | None = None, points: ArrayLike | None = None
+    varieties: Varieties,
+    kind: str,
+    *,
+    variety: int | None = None,
+    points: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
 ) -> Primitive:
     """The primitive that a variety stands for.
 
@@ -52,6 +57,7 @@ def recover(
         kind: "plane", "cylinder", "cone", "sphere"; "box" from two or three planes, its faces; or "quadric".
         variety: Which of C varieties; the one of largest total membership where not given. A box takes all of them.
         points: The points (N, 3) of the fit.
+        weights: Their weights (N,) in the fit, where they had any.
 
     Returns:
         The primitive; a `Quadric` where the kind does not hold (see `holds`). While JAX traces, values cannot choose a type and
@@ -64,9 +70,12 @@ def recover(
     inliers = None if points is None else checks.points(points, dims=3)
     if inliers is not None and inliers.shape[0] != varieties.noise.shape[0]:
         raise ValueError(f"points must be the {varieties.noise.shape[0]} points of the fit, got {inliers.shape[0]}")
+    if weights is not None and inliers is None:
+        raise ValueError("weights must come with points, whose weights they are")
+    heaviness = None if inliers is None else checks.weights(weights, inliers.shape[0])
     if kind == "quadric":
         return _quadric(varieties, _index(varieties, variety))
-    primitive, right = _found(varieties, _index(varieties, variety), inliers, kind=kind)
+    primitive, right = _found(varieties, _index(varieties, variety), inliers, heaviness, kind=kind)
     if is_concrete(right) and not bool(right):
         return _quadric(varieties, _index(varieties, variety))
     return primitive
@@ -88,7 +97,7 @@ def holds(varieties: Varieties, kind: str, *, variety: int | None = None) -> Boo
     _check(varieties, kind)
     if kind == "quadric":
         return jnp.asarray(True)
-    return _found(varieties, _index(varieties, variety), None, kind=kind)[1]
+    return _found(varieties, _index(varieties, variety), None, None, kind=kind)[1]
 
 
 def _check(varieties: Varieties, kind: str) -> None:
@@ -110,19 +119,22 @@ def _check(varieties: Varieties, kind: str) -> None:
 
 
 @partial(jax.jit, static_argnames="kind")
-def _found(varieties: Varieties, at: Array, points: Array | None, *, kind: str) -> tuple[Primitive, Bool[Array, ""]]:
+def _found(
+    varieties: Varieties, at: Array, points: Array | None, weights: Array | None, *, kind: str
+) -> tuple[Primitive, Bool[Array, ""]]:
     """The primitive of a kind and whether the kind holds."""
+    ends = _Ends(varieties, at, points, weights)
     if kind == "box":
-        primitive, shift, scatter, sound = _box(varieties, points)
+        primitive, shift, scatter, sound = _box(varieties, ends)
     else:
-        primitive, shift, scatter, sound = _shaped(varieties, kind, at, points)
+        primitive, shift, scatter, sound = _shaped(varieties, kind, at, ends)
     rounding = 8 * jnp.sqrt(jnp.finfo(scatter.dtype).eps) * varieties.unit
     return primitive, sound & (shift <= jnp.maximum(scatter, rounding))
 
 
 def _index(varieties: Varieties, variety: int | None) -> Array:
     if variety is None:
-        return jnp.argmax(varieties.memberships.sum(axis=0))
+        return jnp.argmax(varieties.masses)
     return jnp.asarray(checks.integer(variety, "variety", at_least=0, at_most=varieties.centers.shape[0] - 1))
 
 
@@ -187,7 +199,7 @@ def _axis(varieties: Varieties, at: Array, free: Float[Array, " Q"]) -> Float[Ar
     return axis * jnp.where(axis[jnp.argmax(jnp.abs(axis))] < 0, -1, 1)
 
 
-def _shaped(varieties: Varieties, kind: str, at: Array, points: Array | None) -> tuple[Primitive, Array, Array, Array]:
+def _shaped(varieties: Varieties, kind: str, at: Array, ends: "_Ends") -> tuple[Primitive, Array, Array, Array]:
     """The primitive, how far its ties move the surface, how far inliers scatter about it, and whether its numbers are real."""
     dtype = varieties.centers.dtype
     mixing = jnp.asarray(table(_name(varieties)), dtype)
@@ -210,7 +222,6 @@ def _shaped(varieties: Varieties, kind: str, at: Array, points: Array | None) ->
     tied = _tied(varieties, at, own)
     linear = tied.parts[len(ties) :] @ directions
     shift_square = jnp.maximum(tied.square - free.square, 0)
-    ends = _Ends(varieties, at, points)
     primitive: Primitive
     if kind == "plane":
         normal = normalised(linear)
@@ -220,7 +231,7 @@ def _shaped(varieties: Varieties, kind: str, at: Array, points: Array | None) ->
 
     # A surface of huge radius is a plane: only a plane that fits worse by five standard errors is told from it.
     flat = _tied(varieties, at, _linear(directions) @ unmixed(mixing).T)
-    chance = 25 * divide(free.square, varieties.memberships[:, at].sum())
+    chance = 25 * divide(free.square, varieties.masses[at])
     curved = flat.square - free.square > jnp.maximum(chance, 64 * jnp.finfo(dtype).eps * unit**2)
     curvature = tied.parts[0]
     center = -divide(linear, 2 * curvature)
@@ -295,12 +306,14 @@ class _Ends(NamedTuple):
     varieties: Varieties
     at: Array
     points: Array | None
+    weights: Array | None
 
     def _measured(self, directions: Float[Array, "K 3"]) -> Float[Array, "K 2"]:
         v = self.varieties
         assert self.points is not None
-        own = v.memberships[:, self.at] * (v.labels == self.at)
-        own = jnp.where(own.sum() > 0, own, v.memberships[:, self.at])
+        all_of = v.memberships[:, self.at] * (1 if self.weights is None else self.weights)
+        own = all_of * (v.labels == self.at)
+        own = jnp.where(own.sum() > 0, own, all_of)
         return jax.vmap(weighted_range, (1, None))(self.points @ directions.T, own)
 
     def along(self, axis: Float[Array, "3"], across: Float[Array, "3"]) -> Float[Array, "2"]:
@@ -341,7 +354,7 @@ def _patch(on: Array, normal: Array, ends: _Ends) -> Plane:
     return Plane(corners.mean(axis=0), normal, corners)
 
 
-def _box(varieties: Varieties, points: Array | None) -> tuple[Primitive, Array, Array, Array]:
+def _box(varieties: Varieties, ends_of: _Ends) -> tuple[Primitive, Array, Array, Array]:
     """The box of two or three faces, how far squaring its corners moves them, how far inliers scatter about them."""
     faces, centers = varieties.normals, varieties.centers
     third = normalised(jnp.cross(faces[0], faces[1]))
@@ -352,7 +365,8 @@ def _box(varieties: Varieties, points: Array | None) -> tuple[Primitive, Array, 
         others = [c for c in range(known) if c != i]
         starts, stops = [], []
         for c in others:
-            start, stop = _Ends(varieties, jnp.asarray(c), points).of_rectangle(axes[jnp.array([i, 3 - i - c])])[0]
+            of_face = ends_of._replace(at=jnp.asarray(c))
+            start, stop = of_face.of_rectangle(axes[jnp.array([i, 3 - i - c])])[0]
             starts.append(start)
             stops.append(stop)
         low, high = jnp.stack(starts).min(), jnp.stack(stops).max()

@@ -24,6 +24,9 @@ Sums = TypeVar("Sums")
 
 # Values a tile's distances may hold: with 4-byte floats 64 KiB, which stays in a core's second-level cache.
 TILE_VALUES = 16_384
+# A point of weight 0 is where it is, so that it has memberships and its weight a derivative; but no farther from the others, in
+# their own spread, than a sum that it is multiplied by 0 in can bear.
+FARTHEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -180,9 +183,10 @@ def _design(
 
     def put(at: Array, blocks: Array) -> Array:
         cut = points.at[at * rows + jnp.arange(rows)].get(mode="fill", fill_value=0, indices_are_sorted=True)
-        # A point of weight 0 may hold anything finite; it must not reach the sums.
-        held = _present(count, rows, at) if weights is None else weights[at] > 0
-        inside = jnp.where(held, (cut.T - mean[:, None]) / scale, 0)
+        inside = (cut.T - mean[:, None]) / scale
+        if weights is not None:
+            inside = jnp.where(weights[at] > 0, inside, tame(inside))
+        inside = jnp.where(_present(count, rows, at), inside, 0)
         # With its squared length and a 1 beside each point, distances and sums are one matrix product each.
         longer = [inside, jnp.square(inside).sum(axis=0, keepdims=True), jnp.ones_like(inside[:1])]
         return blocks.at[at].set(jnp.concatenate(longer))
@@ -199,12 +203,17 @@ def _design_jvp(rows: int, primals: tuple[Array, ...], tangents: tuple[Any, ...]
         return blocks, jax.custom_derivatives.zero_from_primal(blocks)
     moved = _cut(tangents[0], rows) / scale
     if weights is not None:
-        moved = jnp.where(weights[:, None] > 0, moved, 0)
+        moved = jnp.where((weights[:, None] > 0) | (jnp.abs(blocks[:, : moved.shape[1]]) < FARTHEST), moved, 0)
     longer = 2 * (blocks[:, : moved.shape[1]] * moved).sum(axis=1, keepdims=True)
     return blocks, jnp.concatenate([moved, longer, jnp.zeros_like(longer)], axis=1)
 
 
 _design.defjvp(_design_jvp, symbolic_zeros=True)
+
+
+def tame(places: Array) -> Array:
+    """Places, in units of the points' spread, that may be anything, even no numbers, as some that can be multiplied by 0."""
+    return jnp.where(jnp.isfinite(places), jnp.clip(places, -FARTHEST, FARTHEST), 0)
 
 
 def frame(points: Float[Array, "N D"], weights: Float[Array, " N"] | None) -> tuple[Array, Array]:

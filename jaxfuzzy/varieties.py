@@ -34,6 +34,7 @@ from jaxfuzzy.varietystep import (
     directions,
     divide_points,
     jacobian,
+    local_places,
     moments,
     pose,
     powers,
@@ -217,7 +218,7 @@ def _fit_one(
     share = powers(part.log_powers(m), weights)
     mean, unit = lax.stop_gradient(frame(points, weights))
     unit = jnp.where(unit > 0, unit, 1)
-    local = jnp.where(used[:, None], (points - mean) / unit, 0)
+    local = local_places(points, weights, mean, unit)
     local_centers, scatter = weighted_moments(monomials(local) @ table.T, share)
     gradients = jnp.einsum("qm,nmd->nqd", table, monomial_gradients(local))
     own = weights[:, None] * u * (labels[:, None] == jnp.arange(u.shape[1]))
@@ -236,7 +237,7 @@ def _fit_one(
         noise=part.noise,
         labels=labels,
         inliers=~noisy,
-        objective=jnp.where(used, part.objective(m), 0) @ weights * place.unit**2,
+        objective=part.objective(m) @ weights * place.unit**2,
         steps=solution.steps,
         status=status(theta, sums, real, across, extents, inliers, solution.converged),
         m=m,
@@ -247,6 +248,7 @@ def _fit_one(
         scatter=scatter,
         slopes=jnp.einsum("cn,nqd,npd->cqp", shares_of_one(share), gradients, gradients),
         bounds=jax.vmap(jax.vmap(weighted_range, (1, None), 1), (None, 1))(points, own),
+        masses=weights @ u,
         embedding=names,
         distance=distance,
     )

@@ -21,6 +21,7 @@ from jaxfuzzy.varietystep import (
     Task,
     directions,
     divide_points,
+    local_places,
     padded_moments,
     pose,
     powers,
@@ -68,6 +69,7 @@ class Ends:
         inliers: How many points with weight are no noise.
         low: Lowest coordinates of each variety's own points.
         high: Highest ones.
+        masses: Weighted sum of the memberships in each variety.
     """
 
     solving: Moments
@@ -76,6 +78,7 @@ class Ends:
     inliers: Int[Array, ""]
     low: Float[Array, "C D"]
     high: Float[Array, "C D"]
+    masses: Float[Array, " C"]
 
 
 def fit_blocks(
@@ -154,6 +157,7 @@ def fit_blocks(
             scatter=as_type(local.scatter),
             slopes=as_type(local.metric),
             bounds=as_type(_range(counts, low, high)),
+            masses=as_type(sum(np.asarray(one.masses, float) for one in ends)),
             embedding=embedding,
             distance=distance,
         )
@@ -243,7 +247,7 @@ def _divided(theta: Prototypes, task: Task) -> tuple[Any, Array, Array, Moments]
     logs = part.log_powers(task.m)
     share = powers(logs, task.weights)
     top = jnp.where(task.weights > 0, logs, -jnp.inf).max(axis=1)
-    objective = jnp.where(task.weights > 0, part.objective(task.m), 0) @ task.weights
+    objective = part.objective(task.m) @ task.weights
     return part, share, top, _sums(task.features.T, task.slopes, share, top, objective)
 
 
@@ -260,7 +264,7 @@ def _ends_of_block(
     task, _ = _pose(given, points, weights, geometric=geometric)
     part, share, top, solving = _divided(theta, task)
     used = weights > 0
-    inside = jnp.where(used[:, None], (points - local[0]) / local[1], 0)
+    inside = local_places(points, weights, *local)
     gradients = jnp.einsum("qm,nmd->nqd", given[0], monomial_gradients(inside))
     slopes = jnp.einsum("nqd,npd->qpn", gradients, gradients)
     labels = _labels(part)
@@ -273,6 +277,7 @@ def _ends_of_block(
         inliers=((labels >= 0) & used).sum(),
         low=jnp.where(mine[:, :, None], points, jnp.inf).min(axis=1),
         high=jnp.where(mine[:, :, None], points, -jnp.inf).max(axis=1),
+        masses=part.memberships @ weights,
     )
 
 

@@ -39,6 +39,7 @@ class Varieties:
         slopes: Mean of their ∇phi ∇phiᵀ under the same weights: n · scatter n / n · slopes n is a mean squared distance.
         bounds: Lowest and highest coordinates of each variety's inliers: their 2 % and 98 % quantiles, stretched as if they
             were spread evenly, so that one outlier moves nothing.
+        masses: Weighted sum of the memberships in each variety.
         embedding: Name of the embedding, or the names.
         distance: Which distance was used.
     """
@@ -62,6 +63,7 @@ class Varieties:
     scatter: Float[Array, "C Q Q"]
     slopes: Float[Array, "C Q Q"]
     bounds: Float[Array, "C 2 D"]
+    masses: Float[Array, " C"]
     embedding: str | tuple[str, ...] = static()
     distance: str = static(default="geometric")
 

@@ -13,12 +13,14 @@ from jaxfuzzy.embedding import monomial_gradients, monomials, monomials_of_affin
 from jaxfuzzy.linalg import divide, normalised, pencil, smallest_eigenvector, smallest_projector, weighted_moments
 from jaxfuzzy.memberships import Shares, shares
 from jaxfuzzy.status import Status
-from jaxfuzzy.tiles import frame
+from jaxfuzzy.tiles import FARTHEST, frame, tame
 
 # A surface whose second smallest mean squared distance is not this much above the smallest is one of many that fit.
 LEAST_GAP = 4.0
 # Two varieties count as one where they are this near, in units of the points' RMS spread, and their projectors as alike.
 SAME_PLACE = 1e-4
+# Logarithm of how far a point of weight 0 may be above all others in its membership.
+MOST_ABOVE = 40.0
 # Values that one pass of the Jacobian may hold at a time: 4 MiB of 4-byte floats.
 JACOBIAN_VALUES = 2**20
 
@@ -84,36 +86,47 @@ def pose(
     centered and scaled. The algebraic one depends on where the points are, so only the embedded points are. Both maps
     commute with a step, and carry no derivative.
     """
-    used = (weights > 0)[:, None]
-    points = jnp.where(used, points, 0)
     if geometric:
         mean, unit = lax.stop_gradient(frame(points, weights) if whole is None else whole[:2])
         unit = jnp.where(unit > 0, unit, 1)
-        points = jnp.where(used, (points - mean) / unit, 0)
+        points = local_places(points, weights, mean, unit)
         gradients = jnp.einsum("qm,nmd->nqd", table, monomial_gradients(points))
         slopes = jnp.einsum("nqd,npd->qpn", gradients, gradients)
         features = monomials(points) @ table.T
         middle = lax.stop_gradient(weights @ features / weights.sum() if whole is None else whole[2])
-        features = jnp.where(used, features - middle, 0)
+        features = features - middle
         matrix, constant = monomials_of_affine(unit, mean)
         inverse, _ = monomials_of_affine(1 / unit, -mean / unit)
         back, forward = (table @ change @ unmixed(table).T for change in (matrix, inverse))
         place = Frame(table @ constant + back @ middle, back, forward, unit)
     else:
+        here, reach = lax.stop_gradient(frame(points, weights))
+        reach = jnp.where(reach > 0, reach, 1)
+        points = jnp.where((weights > 0)[:, None], points, here + reach * local_places(points, weights, here, reach))
         features, slopes = monomials(points) @ table.T, None
         middle, unit = lax.stop_gradient(frame(features, weights) if whole is None else (whole[2], whole[1]))
         unit = jnp.where(unit > 0, unit, 1)
-        features = jnp.where(used, (features - middle) / unit, 0)
+        features = (features - middle) / unit
         one = jnp.eye(middle.size, dtype=unit.dtype)
         place = Frame(middle, one * unit, one / unit, unit)
     squared_noise = None if noise_distance is None else jnp.square(noise_distance / unit)
     return Task(features.T, slopes, weights, m, squared_noise, real, across), place
 
 
+def local_places(
+    points: Float[Array, "N D"], weights: Float[Array, " N"], mean: Array, unit: Array
+) -> Float[Array, "N D"]:
+    """Points in units of their spread about their mean; those of weight 0 where they are, but no farther than sums can bear."""
+    local = (points - mean) / unit
+    # Fourth powers of it are taken.
+    near = jnp.clip(tame(local), -(FARTHEST**0.5), FARTHEST**0.5)
+    return jnp.where((weights > 0)[:, None], local, near)
+
+
 def step(theta: Prototypes, task: Task) -> tuple[Prototypes, Array]:
     """One round of alternating optimisation (eqs. 15 to 17 and 20), and the logarithm of the objective it started from."""
     part, _ = divide_points(theta, task)
-    objective = jnp.where(task.weights > 0, part.objective(task.m), 0) @ task.weights
+    objective = part.objective(task.m) @ task.weights
     sums = moments(powers(part.log_powers(task.m), task.weights), task)
     return prototypes(sums, task.across), jnp.log(objective)
 
@@ -134,10 +147,11 @@ def divide_points(theta: Prototypes, task: Task) -> tuple[Shares, Float[Array, "
 
 def powers(log_powers: Float[Array, "C N"], weights: Float[Array, " N"]) -> Float[Array, "C N"]:
     """Weights times memberships to the power m, relative to each variety's largest one, so that they never all underflow."""
-    logs = jnp.where(weights > 0, log_powers, -jnp.inf)
-    top = lax.stop_gradient(logs.max(axis=1, keepdims=True))
-    some = logs > -jnp.inf
-    return jnp.where(some, jnp.exp(jnp.where(some, logs - jnp.where(top > -jnp.inf, top, 0), 0)), 0) * weights
+    top = lax.stop_gradient(jnp.where(weights > 0, log_powers, -jnp.inf).max(axis=1, keepdims=True))
+    some = log_powers > -jnp.inf
+    # Above the largest are at most points of weight 0, which count for nothing unless they overflow.
+    above = jnp.minimum(log_powers - jnp.where(top > -jnp.inf, top, 0), MOST_ABOVE)
+    return jnp.where(some, jnp.exp(jnp.where(some, above, 0)), 0) * weights
 
 
 Moments = tuple[Array, Array, Array | None]

@@ -213,6 +213,33 @@ def test_weights_are_repetitions(seed, filler):
     assert np.isfinite(np.asarray(weighted.memberships)).all()
 
 
+@pytest.mark.parametrize("noise_distance", [None, 3.0])
+def test_points_of_weight_zero_are_where_they_are(noise_distance):
+    """Held out they change nothing, yet have the memberships of new points there, and their weights the derivative there."""
+    x, seeds = blobs((30, 20, 25), seed=7)
+    weights = np.arange(len(x)) % 4 > 0
+    options = {"m": 1.8, "noise_distance": noise_distance, "solver": EXACT}
+    run = lambda w: fcm(x, seeds, weights=w, **options)
+    fit, alone = run(weights.astype(float)), fcm(x[weights], seeds, **options)
+    np.testing.assert_allclose(fit.centers, alone.centers, atol=1e-12)
+    np.testing.assert_allclose(fit.memberships, memberships(x, alone), atol=1e-11)
+    mix = jnp.arange(1.0, 1 + fit.centers.size).reshape(fit.centers.shape)
+    total = lambda w: (mix * run(w).centers).sum()
+    w = jnp.asarray(weights, float)
+    slope = jax.grad(total)(w)
+    for at in (0, 40):
+        assert w[at] == 0
+        here, one, two = (total(w.at[at].set(step)) for step in (0.0, 1e-4, 2e-4))
+        np.testing.assert_allclose(slope[at], (4 * one - two - 3 * here) / 2e-4, rtol=1e-6)
+
+
+def test_points_of_weight_zero_do_not_hide_that_all_others_are_noise():
+    x = np.array([[0.0, 0], [0, 9], [9, 0], [9, 9], [4.5, 4.5]])
+    fit = fcm(x, x[4:], noise_distance=0.1, weights=np.array([1.0, 1, 1, 1, 0]))
+    assert (np.asarray(fit.labels)[:4] == -1).all()
+    assert int(fit.status) & Status.ALL_NOISE
+
+
 def test_noise_rules():
     x, seeds = blobs()
     plain = fcm(x, seeds, solver=EXACT)

@@ -100,6 +100,38 @@ def test_known_truth(fits, kind, embedding):
     check(kind, recover(fit, NAMES[kind], points=cloud(kind)), tilted=embedding == "9d")
 
 
+@pytest.mark.parametrize("count", [15, 60])
+def test_few_inliers_end_where_they_do_whatever_else_there_is(count):
+    """Quantiles of fewer than 25 points lie beyond the last: what follows there, outliers and pads, must not lead them on."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-1.5, 1.5, count) - np.pi / 2
+    own = np.stack([0.2 + 0.05 * np.cos(angle), np.linspace(0, 0.12, count), 1 + 0.05 * np.sin(angle)], 1)
+    own += 3e-4 * rng.normal(size=own.shape)
+    fit = lambda p, **options: nfcv(p, np.ones((len(p), 1)), embedding="cylinder", noise_distance=0.005, **options)
+    alone = recover(fit(own), "cylinder", points=own).height
+    assert float(alone) == pytest.approx(0.12, rel=0.1)
+    far = np.r_[own, [[0.2, 5, 1], [0.2, -5, 1]]]
+    pads, weights = np.r_[own, np.full((40, 3), 50.0)], np.r_[np.ones(count), np.zeros(40)]
+    for height in (
+        recover(fit(far), "cylinder").height,
+        recover(fit(far), "cylinder", points=far).height,
+        recover(fit(pads, weights=weights), "cylinder").height,
+        recover(fit(pads, weights=weights), "cylinder", points=pads, weights=weights).height,
+    ):
+        np.testing.assert_allclose(height, alone, rtol=1e-5)
+
+
+def test_the_heaviest_variety_is_the_one_with_most_weight():
+    rng = np.random.default_rng(1)
+    flat = lambda count, z: np.column_stack([rng.uniform(-1, 1, (count, 2)), z + 1e-3 * rng.normal(size=count)])
+    points, weights = np.r_[flat(40, 1.0), flat(30, 1.3)], np.r_[np.ones(40), np.full(30, 10.0)]
+    start = np.where((np.arange(70) < 40)[:, None], [0.9, 0.1], [0.1, 0.9])
+    plane = recover(nfcv(points, start, embedding="3d", weights=weights, noise_distance=0.02), "plane")
+    assert float(plane.point[2]) == pytest.approx(1.3, abs=0.01)
+    with pytest.raises(ValueError, match="weights must come with points"):
+        recover(nfcv(points, start, embedding="3d"), "plane", weights=weights)
+
+
 @pytest.mark.parametrize("embedding", ["6d", "cone"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_does_not_hold_is_a_quadric(fits, kind, embedding):

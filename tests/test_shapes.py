@@ -417,6 +417,18 @@ def test_scores_by_other_criteria(clouds):
     )
 
 
+@pytest.mark.parametrize("count", [64, 129, 300])
+def test_extents_by_the_papers_rule_are_those_of_the_points(count):
+    """Points are padded to a compiled size; the pads must end nothing, nor hide where the body ends."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-1.5, 1.5, count) - np.pi / 2
+    points = np.stack([0.2 + 0.05 * np.cos(angle), rng.uniform(0, 0.12, count), 1 + 0.05 * np.sin(angle)], 1)
+    shape = fit_shape(
+        points + 5e-4 * rng.normal(size=points.shape), rule="paper", noise_distance=0.005, kinds=("cylinder",)
+    )
+    assert float(shape.primitive.height) == pytest.approx(0.12, rel=0.05)
+
+
 def test_the_papers_rule_counts_points():
     # A cylinder before the camera, in raw coordinates: 4D and 6D hold it alike, which is the rule's weakness.
     cloud = simulate_object("cylinder", 52, outliers=0.1)

@@ -159,6 +159,25 @@ def test_hostile_padding_is_no_padding(distance):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((fit.scatter, fit.slopes, fit.objective)))
 
 
+@pytest.mark.parametrize("distance", ["algebraic", "geometric"])
+def test_points_of_weight_zero_are_where_they_are(distance):
+    weights = np.arange(140) % 5 > 0
+    options = {"embedding": "cylinder", "noise_distance": 0.3, "distance": distance, "solver": TIGHT}
+    run = lambda w: nfcv(ONE, ALL, weights=w, **options)
+    fit, whole = run(weights.astype(float)), nfcv(ONE, ALL, **options)
+    alone = nfcv(ONE[weights], ALL[weights], **options)
+    np.testing.assert_allclose(fit.centers, alone.centers, atol=800 * EPS)
+    np.testing.assert_allclose(fit.bounds, alone.bounds, atol=800 * EPS)
+    # The points are about a tenth of the noise distance off, held out or not; none is where their mean is.
+    held_out, there = (np.sqrt(of.squared_distances[~weights, 0]) for of in (fit, whole))
+    np.testing.assert_allclose(held_out, there, atol=0.1 * np.ptp(there) + 1e-3)
+    total = lambda w: run(w).centers.sum() + run(w).objective
+    w = jnp.asarray(weights, float)
+    here, one, two = (total(w.at[5].set(step)) for step in (0.0, 1e-4, 2e-4))
+    # The quotient of two differences of 1e-4 has an error of 1e-8 of the third derivative, and of 1e-12 of rounding.
+    np.testing.assert_allclose(jax.grad(total)(w)[5], (4 * one - two - 3 * here) / 2e-4, rtol=1e-6, atol=1e-8)
+
+
 def test_weights_count_points():
     counts = np.random.default_rng(6).permutation(np.repeat([0, 1, 2, 1], 35))
     options = {"embedding": "cylinder", "noise_distance": 0.3, "solver": TIGHT}
