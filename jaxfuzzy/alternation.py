@@ -325,6 +325,7 @@ def judge(
         (Status.UNSTABLE, parted.any() & (tiles.spread > 0)),
         (Status.TOO_FEW_POINTS, tiles.present < real.sum()),
         (Status.DEGENERATE, tiles.spread <= 0),
+        (Status.EMPTY, (real & ~(sums.mass > 0)).any()),
     ]
     if sizes:
         alpha = jnp.exp(log_sizes_of(theta, mask))

@@ -24,7 +24,7 @@ def points(value: Any, name: str = "points", *, dims: int | None = None) -> Arra
     """Points as a float array (N, D): 2-D, real, at least one row, finite where known."""
     if value is None or isinstance(value, str | bytes):
         raise TypeError(f"{name} must be an array of shape (N, D), got {type(value).__name__}")
-    array = _numeric(value, name)
+    array = real(value, name)
     if array.ndim != 2:
         raise ValueError(f"{name} must have two axes (N, D), got shape {tuple(array.shape)}")
     if array.shape[0] < 1 or array.shape[1] < 1:
@@ -52,7 +52,7 @@ def weights(value: Any, count: int, name: str = "weights") -> Array | None:
     """Weights as a float array (N,): non-negative, finite, not all zero; None stays None (every weight 1)."""
     if value is None:
         return None
-    array = as_float(_numeric(value, name))
+    array = as_float(real(value, name))
     if array.shape != (count,):
         raise ValueError(f"{name} must have shape ({count},), one a point, got {tuple(array.shape)}")
     _finite(array, name)
@@ -94,7 +94,7 @@ def noise_distance(value: Any, count: int | None = None, name: str = "noise_dist
     """A noise distance: None, a number above 0, or where `count` is given an array (count,) of them."""
     if value is None:
         return None
-    array = _numeric(value, name)
+    array = real(value, name)
     allowed: tuple[tuple[int, ...], ...] = ((),) if count is None else ((), (count,))
     if array.shape not in allowed:
         raise ValueError(f"{name} must have shape {' or '.join(map(str, allowed))}, got {tuple(array.shape)}")
@@ -105,7 +105,7 @@ def noise_distance(value: Any, count: int | None = None, name: str = "noise_dist
 
 def number(value: Any, name: str, *, above: float | None = None, at_least: float | None = None) -> Any:
     """One finite real number, above or at least a bound."""
-    array = _numeric(value, name)
+    array = real(value, name)
     if array.shape != ():
         raise ValueError(f"{name} must be one number, got shape {tuple(array.shape)}")
     if is_concrete(array):
@@ -134,9 +134,23 @@ def choice(value: Any, name: str, allowed: Collection[Any]) -> Any:
     return value
 
 
+def kind(value: Any, name: str, wanted: type) -> Any:
+    """A record of the library's own."""
+    if not isinstance(value, wanted):
+        raise TypeError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
+    return value
+
+
+def flag(value: Any, name: str) -> bool:
+    """True or False, known now (it chooses what is compiled)."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
 def direction(value: Any, name: str) -> np.ndarray:
     """A direction (3,): finite, not of length zero; given back with length 1."""
-    array = np.asarray(_numeric(value, name), float)
+    array = np.asarray(real(value, name), float)
     if array.shape != (3,):
         raise ValueError(f"{name} must have shape (3,), got {tuple(array.shape)}")
     length = float(np.linalg.norm(array))
@@ -147,7 +161,7 @@ def direction(value: Any, name: str) -> np.ndarray:
 
 def position(value: Any, name: str) -> np.ndarray:
     """A place (3,), finite."""
-    array = np.asarray(_numeric(value, name), float)
+    array = np.asarray(real(value, name), float)
     if array.shape != (3,):
         raise ValueError(f"{name} must have shape (3,), got {tuple(array.shape)}")
     if not np.isfinite(array).all():
@@ -167,8 +181,12 @@ def labels(value: Any, count: int, name: str = "labels") -> np.ndarray:
     return array
 
 
-def _numeric(value: Any, name: str) -> Any:
-    array = value if isinstance(value, jax.Array | np.ndarray) else np.asarray(value)
+def real(value: Any, name: str) -> Any:
+    """Real numbers of any shape."""
+    try:
+        array = value if isinstance(value, jax.Array | np.ndarray) else np.asarray(value)
+    except ValueError:
+        raise ValueError(f"{name} must be rows of one length") from None
     if array.dtype.kind not in "fiub" and not jax.numpy.issubdtype(array.dtype, jax.numpy.floating):
         raise TypeError(f"{name} must be real numbers, got {array.dtype}")
     return array

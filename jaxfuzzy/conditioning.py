@@ -34,7 +34,11 @@ def conditioning(
     """
     array = checks.points(points)
     heaviness = checks.weights(weights, array.shape[0])
+    if not isinstance(fit, Partition | Varieties):
+        raise TypeError(f"fit must be a Partition or Varieties, got {type(fit).__name__}")
     if isinstance(fit, Partition):
+        if fit.labels.shape[0] not in (0, array.shape[0]):
+            raise ValueError(f"points must be the {fit.labels.shape[0]} points of the fit, got {array.shape[0]}")
         if array.shape[1] != fit.centers.shape[1]:
             raise ValueError(f"points must have {fit.centers.shape[1]} coordinates as in the fit, got {array.shape[1]}")
         return _smallest(jacobian(array, fit, heaviness))

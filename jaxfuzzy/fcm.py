@@ -107,7 +107,8 @@ def fcm(
 
     Minimises eq. 8 of the paper by eqs. 9 to 11, with a noise cluster (Davé 1991, eqs. 19 and 20) where a noise distance is given;
     without sizes this is Bezdek's fuzzy c-means. Runs under `jit`, `vmap` and `grad`: centers, sizes, memberships, noise and
-    objective have derivatives with respect to `points`, `weights`, `m` and `noise_distance`, those of the fixed point reached.
+    objective have first derivatives with respect to `points`, `weights`, `m` and `noise_distance`, those of the fixed point
+    reached; second ones are refused.
 
     The sizes alpha are not shares of points: alpha_i goes with S_i^(1/m), S_i the cluster's sum of u^m times squared distance.
 
@@ -119,7 +120,8 @@ def fcm(
         sizes: Whether to learn the sizes (eq. 11); otherwise all are 1/K.
         noise_distance: Distance of the noise cluster from every point, in the unit of the points; a `NoiseRule` to take it from the
             data; None for no noise cluster.
-        weights: Weight of each point (N,), not negative: weight 2 is the point twice, weight 0 the point absent.
+        weights: Weight of each point (N,), not negative: weight 2 is the point twice, weight 0 the point absent, though it has
+            memberships too.
         memberships: Whether to make memberships, noise and labels; without them nothing of size N × K ever exists.
         solver: Steps, tolerance and acceleration.
 
@@ -131,6 +133,8 @@ def fcm(
         TypeError: Points, seeds or weights that are not real numbers.
     """
     checks.fuzzifier(m)
+    checks.kind(solver, "solver", Solver)
+    sizes, memberships = checks.flag(sizes, "sizes"), checks.flag(memberships, "memberships")
     square = is_concrete(m) and float(m) == 2
     if isinstance(points, Blocks):
         if memberships:
@@ -140,7 +144,7 @@ def fcm(
         if isinstance(noise_distance, NoiseRule):
             raise ValueError("noise_distance must be a number or None for blocks, got a NoiseRule")
         checks.noise_distance(noise_distance)
-        return _fit_blocks(points, seeds, m, noise_distance, weights, solver, sizes=bool(sizes), square=square)
+        return _fit_blocks(points, seeds, m, noise_distance, weights, solver, sizes=sizes, square=square)
     points = checks.points(points)
     seeds = _checked_seeds(seeds, points.shape)
     weights = checks.weights(weights, points.shape[0])
@@ -160,9 +164,9 @@ def fcm(
         solver.traced(dtype),
         mask=None,
         rule=rule,
-        sizes=bool(sizes),
+        sizes=sizes,
         square=square,
-        memberships=bool(memberships),
+        memberships=memberships,
         parts=parts,
     )
 
@@ -397,7 +401,9 @@ def memberships(points: ArrayLike, partition: Partition) -> Float[Array, "N K"]:
 
     Raises:
         ValueError: Points of another dimension, or not finite.
+        TypeError: The partition is none.
     """
+    checks.kind(partition, "partition", Partition)
     points = checks.points(points, dims=partition.centers.shape[1])
     return _memberships_of(points.astype(jnp.result_type(points, partition.centers)), partition)[0]
 

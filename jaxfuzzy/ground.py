@@ -238,6 +238,7 @@ def upright(points: Float[ArrayLike, "N 3"], ground: Plane) -> tuple[Array, Arra
         The points turned (N, 3), the rotation (3, 3) and the origin (3,): turned = rotation @ (point - origin).
     """
     cloud = checks.places(points)
+    checks.kind(ground, "ground", Plane)
     rotation = upright_rotation(ground.normal).astype(cloud.dtype)
     origin = ground.point.astype(cloud.dtype)
     return (cloud - origin) @ rotation.T, rotation, origin

@@ -101,6 +101,7 @@ def holds(varieties: Varieties, kind: str, *, variety: int | None = None) -> Boo
 
 
 def _check(varieties: Varieties, kind: str) -> None:
+    checks.kind(varieties, "varieties", Varieties)
     if not isinstance(varieties.embedding, str):
         raise ValueError(
             f"varieties must be of one embedding, got {len(varieties.embedding)}: use varieties.pick(name)"

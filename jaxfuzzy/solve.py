@@ -1,7 +1,7 @@
 """The one fixed-point loop: plain or Anderson-accelerated, guarded, with an implicit derivative of its own.
 
 A method gives its step, a map from prototypes to prototypes; `fixed_point` iterates it in an optimistix `lax.while_loop` until
-the prototypes stand still, and differentiates the fixed point by the implicit function theorem,
+the prototypes stand still, and differentiates the fixed point, once, by the implicit function theorem,
 
     d theta = (I - dT/dtheta)^+ dT,
 
@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 
@@ -58,6 +57,8 @@ class Solver:
         if is_concrete(self.tol):
             checks.number(self.tol, "tol", at_least=0.0)
         checks.choice(self.acceleration, "acceleration", ("anderson", None))
+        if self.mesh is not None:
+            checks.kind(self.mesh, "mesh", jax.sharding.Mesh)
 
     def traced(self, dtype: Any) -> "Effort":
         """The same as values that JAX traces, so that another tolerance or step limit needs no other compilation."""
@@ -191,12 +192,23 @@ def _solve_jvp(
         tangent = [change for on, change in zip(moving, changes, strict=True) if on]
         forced = jax.jvp(of_moving, (primal,), (tangent,))[1]
         response = _pseudo_inverse(jnp.eye(y.size, dtype=y.dtype) - jacobian(y, args))
-        dy = lax.stop_gradient(response) @ forced
+        dy = _once(response) @ _once(forced)
     no_tangent = jax.custom_derivatives.zero_from_primal
     return out, (dy, *(no_tangent(value) for value in out[1:]))
 
 
 _solve.defjvp(_solve_jvp, symbolic_zeros=True)
+
+
+@jax.custom_jvp
+def _once(value: Array) -> Array:
+    """A value that is part of a first derivative, whose own derivative is not known."""
+    return value
+
+
+@_once.defjvp
+def _once_jvp(primals: Any, tangents: Any) -> Any:
+    raise NotImplementedError("second derivatives of a fit are not computed: differentiate it once")
 
 
 def _pseudo_inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:

@@ -42,6 +42,7 @@ class Status(enum.IntFlag):
     SCATTERED = 1 << 27
     SEEN_THROUGH = 1 << 28
     PIECE = 1 << 29
+    EMPTY = 1 << 30
 
 
 SENTENCES: dict[Status, str] = {
@@ -51,6 +52,8 @@ SENTENCES: dict[Status, str] = {
     Status.COLLAPSED: "All centers sit at the mean, which is a local minimum for this fuzzifier: lower m.",
     Status.MERGED: "Two or more centers coincide, so their memberships are shared: ask for fewer clusters or lower m.",
     Status.DYING: "A cluster's size is going to zero: ask for fewer clusters, or set sizes=False.",
+    Status.EMPTY: "A cluster has no share of any point that rounding leaves, and its center stays where it was put: give other"
+    " seeds, ask for fewer clusters, or take m nearer to 2.",
     Status.SPIKE: "A center sits on an isolated point and its size shrinks at no cost: give a noise_distance.",
     Status.ALL_NOISE: "No point belongs to a cluster more than to noise: raise noise_distance.",
     Status.TOO_FEW_POINTS: "Too few points with weight for what was asked: give more points or ask for less.",

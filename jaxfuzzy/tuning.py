@@ -101,6 +101,10 @@ def tune(
     if not isinstance(start, Hyper):
         raise TypeError(f"start must be a Hyper, got {type(start).__name__}")
     checks.integer(steps, "steps", at_least=1)
+    if not callable(loss):
+        raise TypeError(f"loss must be a function of a Hyper, got {loss!r}")
+    if solver is not None:
+        checks.kind(solver, "solver", optx.AbstractMinimiser)
     start = _checked(start)
     dtype = jnp.result_type(*jax.tree.leaves(start))
     start = jax.tree.map(lambda leaf: leaf.astype(dtype), start)
@@ -141,7 +145,8 @@ def tune(
         if progress is not None:
             progress(f"tuning: loss {float(trail.losses[-1]):.6g}", evaluations / steps)
     left = _length(state.f_info.grad)
-    level = left <= max(SMALL * steepest * float(scale), _rounding(state.f_info.f))
+    # The gradient of the first evaluation alone has no scale that it could be small beside.
+    level = evaluations > 1 and left <= max(SMALL * steepest * float(scale), _rounding(state.f_info.f))
     status = Status(0)
     if lost:
         status = Status.RAN_AWAY | Status.NOT_CONVERGED
@@ -227,7 +232,7 @@ def _checked(start: Hyper) -> Hyper:
         if value is None and name != "m":
             found[name] = None
             continue
-        array = as_float(value)
+        array = as_float(checks.real(value, f"start.{name}"))
         if is_concrete(array):
             known = np.asarray(array)
             fits = known >= 0 if bound is None else known > bound

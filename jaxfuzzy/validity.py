@@ -67,7 +67,8 @@ def choose_k(
     The indices: "vrc" (eq. 6, Caliński and Harabasz 1974), "xie_beni" (1991, lower is better), "partition_coefficient"
     (Bezdek
     1981) and its normalised form "modified_partition_coefficient" (Davé 1996), "fuzzy_silhouette" (Campello and Hruschka 2006),
-    "jump" (Sugar and James 2003). Of these only "jump" can say k = 1; the partition coefficient is 1 there whatever the data.
+    "jump" (Sugar and James 2003). Of these only "jump" can say k = 1; the partition coefficient is 1 there whatever the data,
+    unless noise takes its share.
 
     Args:
         points: Points (N, D).
@@ -77,7 +78,7 @@ def choose_k(
         index: Which validity index.
         rule: "paper": the smallest k that is a local maximum (an end counts when above its neighbour); where only the upper end is
             one, the smallest k at which the index at least doubles, if any. "best": the best value.
-        noise_distance: As in `fcm`; noise points then count in no index.
+        noise_distance: As in `fcm`; points that belong to noise most then count in no index.
         weights: Weight of each point (N,).
         solver: Steps, tolerance and acceleration.
 
@@ -87,8 +88,12 @@ def choose_k(
     Raises:
         ValueError: Empty or repeated `ks`, a k out of range, 1 among `ks` for an index that cannot score it, unknown names,
             a solver for several devices.
+        TypeError: `ks` are not several whole numbers, or the solver is none.
     """
     array = checks.points(points)
+    checks.kind(solver, "solver", Solver)
+    if not isinstance(ks, Iterable):
+        raise TypeError(f"ks must be several numbers such as (2, 3), got {ks!r}")
     candidates = [
         checks.integer(k, "ks", at_least=1, at_most=array.shape[0], why=" (the number of points)") for k in ks
     ]
@@ -122,7 +127,7 @@ def choose_k(
         solver.traced(array.dtype),
         index=index,
         rule=noise if isinstance(noise, NoiseRule) else None,
-        sizes=bool(sizes),
+        sizes=checks.flag(sizes, "sizes"),
         square=is_concrete(m) and float(m) == 2,
         memberships=True,
     )
@@ -253,6 +258,8 @@ def _jumps(points: Array, partitions: Partition, weights: Array | None) -> Float
 def xie_beni(points: ArrayLike, partition: Partition, *, weights: ArrayLike | None = None) -> Float[Array, ""]:
     """Xie and Beni's index (1991): mean of u^m D over the smallest squared distance of two centers; lower is better.
 
+    Points that belong to noise most are left out.
+
     Args:
         points: The points (N, D) of the fit.
         partition: A partition with at least two clusters and its memberships.
@@ -269,7 +276,7 @@ def xie_beni(points: ArrayLike, partition: Partition, *, weights: ArrayLike | No
 
 def _xie_beni(points: Array, partition: Partition, weights: Array | None, real: Array) -> Float[Array, ""]:
     compact = jnp.zeros((), points.dtype)
-    heaviness = jnp.ones(points.shape[0], points.dtype) if weights is None else weights
+    heaviness = _counted(partition, weights)
     for i in range(partition.centers.shape[0]):
         apart = jnp.square(points - partition.centers[i]).sum(axis=1)
         compact += (heaviness * partition.memberships[:, i] ** partition.m) @ apart
@@ -283,6 +290,8 @@ def partition_coefficient(
 ) -> Float[Array, ""]:
     """Partition coefficient (Bezdek 1981): the mean of the summed squared memberships, 1/K to 1; higher is crisper.
 
+    Points that belong to noise most are left out.
+
     Args:
         partition: A partition with its memberships.
         modified: Davé's normalised form 1 - K/(K-1) (1 - PC), 0 to 1, which does not favour few clusters.
@@ -291,15 +300,22 @@ def partition_coefficient(
     Raises:
         ValueError: A partition made with `memberships=False`.
     """
-    count = partition.memberships.shape[0]
+    count = checks.kind(partition, "partition", Partition).memberships.shape[0]
     if count == 0:
         raise ValueError("partition must carry memberships: fit with memberships=True")
     return _coefficient(partition, checks.weights(weights, count), partition.centers.shape[0], modified=modified)
 
 
 def _coefficient(partition: Partition, weights: Array | None, k: int | Array, *, modified: bool) -> Float[Array, ""]:
-    mean = jnp.average(jnp.square(partition.memberships).sum(axis=1), weights=weights)
+    heaviness = _counted(partition, weights)
+    mean = heaviness @ jnp.square(partition.memberships).sum(axis=1) / heaviness.sum()
     return 1 - k / (k - 1) * (1 - mean) if modified else mean
+
+
+def _counted(partition: Partition, weights: Array | None) -> Float[Array, " N"]:
+    """Weights of the points that count in an index: those that do not belong to noise most."""
+    inside = (partition.labels >= 0).astype(partition.memberships.dtype)
+    return inside if weights is None else inside * weights
 
 
 def fuzzy_silhouette(points: ArrayLike, partition: Partition, *, weights: ArrayLike | None = None) -> Float[Array, ""]:
@@ -350,6 +366,7 @@ def _fuzzy_silhouette(points: Array, partition: Partition, weights: Array | None
 
 
 def _fitted(points: ArrayLike, partition: Partition, weights: ArrayLike | None) -> tuple[Array, Array | None]:
+    checks.kind(partition, "partition", Partition)
     array = as_float(checks.points(points, dims=partition.centers.shape[1]))
     if partition.memberships.shape[0] != array.shape[0]:
         raise ValueError(

@@ -18,10 +18,11 @@ from typing import Any, Literal
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, is_concrete
 from jaxfuzzy.blocks import Blocks
 from jaxfuzzy.embedding import monomial_gradients, monomials, padded_tables
 from jaxfuzzy.linalg import weighted_moments, weighted_range
@@ -59,7 +60,7 @@ def nfcv(
 ) -> Varieties:
     """Fuzzy c-varieties with a noise cluster, in an enlarged data space (eqs. 12 to 21).
 
-    Runs under `jit`, `vmap` and `grad`: everything but steps, labels, inliers and basis has derivatives with respect to
+    Runs under `jit`, `vmap` and `grad`: everything but steps, labels, inliers and basis has first derivatives with respect to
     `points`, `weights`, `m` and `noise_distance`, those of the fixed point reached.
 
     Args:
@@ -91,6 +92,9 @@ def nfcv(
     else:
         points = checks.points(points)
         count, dims = points.shape
+    checks.kind(solver, "solver", Solver)
+    if not isinstance(embedding, Sequence):
+        raise TypeError(f"embedding must be a name or several, got {embedding!r}")
     names = (embedding,) if isinstance(embedding, str) else tuple(embedding)
     if not names:
         raise ValueError("embedding must be a name or several, got none")
@@ -134,6 +138,11 @@ def nfcv(
     memberships = _start(start, count, len(names))
     checks.noise_distance(noise_distance, count)
     weights = checks.weights(weights, count)
+    if weights is not None and is_concrete(memberships) and is_concrete(weights):
+        held = (np.asarray(memberships) * (np.asarray(weights) > 0)[:, None]).max(axis=(0, 1))
+        if not np.all(held > 0):
+            empty = int(np.argmin(held > 0))
+            raise ValueError(f"start must leave no column all zero where points have weight, got column {empty} so")
     parts = Parts.of(points, solver.mesh)
     points = points if parts is None else parts.place(points)
     dtype = jnp.result_type(points, memberships)

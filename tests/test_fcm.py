@@ -233,6 +233,42 @@ def test_points_of_weight_zero_are_where_they_are(noise_distance):
         np.testing.assert_allclose(slope[at], (4 * one - two - 3 * here) / 2e-4, rtol=1e-6)
 
 
+def test_a_cluster_without_points_is_told():
+    """A fuzzifier so near to 1 leaves a center that is nobody's nearest no share that single precision can hold."""
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.normal(size=(50, 2)), rng.normal(size=(50, 2)) + [8, 0]]).astype(np.float32)
+    seeds = np.array([[0, 0], [8, 0], [4, 6]], np.float32)
+    lost = fcm(x, seeds, m=1.01)
+    np.testing.assert_allclose(lost.centers[2], [4, 6], rtol=1e-6)
+    assert int(lost.status) == Status.EMPTY
+    assert int(fcm(x, seeds, m=1.02).status) == int(fcm(x, seeds[:2], m=1.01).status) == 0
+
+
+def test_second_derivatives_are_refused():
+    x, seeds = blobs()
+    center = lambda m: fcm(x, seeds, m=m).centers[0, 0]
+    assert np.isfinite(jax.jit(jax.grad(center))(2.0))
+    for twice in (jax.grad(jax.grad(center)), jax.jacfwd(jax.grad(center)), jax.hessian(center)):
+        with pytest.raises(NotImplementedError, match="second derivatives of a fit are not computed"):
+            twice(2.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "says"),
+    [
+        (lambda x, s: fcm(x, s, solver=None), TypeError, "solver must be a Solver, got NoneType"),
+        (lambda x, s: fcm(x, s, sizes="no"), TypeError, "sizes must be True or False, got 'no'"),
+        (lambda x, s: fcm(x, s, memberships=1), TypeError, "memberships must be True or False, got 1"),
+        (lambda x, s: Solver(mesh=3), TypeError, "mesh must be a Mesh, got int"),
+        (lambda x, s: memberships(x, x), TypeError, "partition must be a Partition, got ndarray"),
+        (lambda x, s: fcm([[1, 2], [3]], s), ValueError, "points must be rows of one length"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(call, error, says):
+    with pytest.raises(error, match=says):
+        call(*blobs())
+
+
 def test_points_of_weight_zero_do_not_hide_that_all_others_are_noise():
     x = np.array([[0.0, 0], [0, 9], [9, 0], [9, 9], [4.5, 4.5]])
     fit = fcm(x, x[4:], noise_distance=0.1, weights=np.array([1.0, 1, 1, 1, 0]))

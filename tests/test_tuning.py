@@ -130,6 +130,12 @@ def test_out_of_steps_is_not_converged():
     assert tuned.evaluations == 3
 
 
+def test_one_evaluation_is_no_minimum():
+    found = tune(lambda hyper: jnp.square(hyper.noise_distance - 3.0), Hyper(noise_distance=1.0), steps=1)
+    assert found.gradients.noise_distance == pytest.approx(-4.0)
+    assert int(found.status) & Status.NOT_CONVERGED
+
+
 def test_a_start_without_slope_is_not_called_a_minimum():
     # Flat to rounding: a minimum here, but a plateau would look the same.
     tuned = tune(by_noise(lambda d: 1 + d**2), Hyper(2.0, 1.0 + 1e-12))

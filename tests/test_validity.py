@@ -64,6 +64,24 @@ def test_other_indices_are_their_definitions():
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("xie_beni", "modified_partition_coefficient")]
 
 
+def test_points_of_noise_count_in_no_index():
+    rng = np.random.default_rng(0)
+    own = np.concatenate([rng.normal(size=(60, 2)), rng.normal(size=(60, 2)) + [8, 0]])
+    angle = np.linspace(0, 6, 90)[:, None]
+    far = np.concatenate([own, [4, 0] + 60 * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)])
+    fit = lambda points: fcm(points, np.array([[0.0, 0], [8, 0]]), noise_distance=2.0)
+    alone, beside = fit(own), fit(far)
+    assert (np.asarray(beside.labels)[120:] == -1).all()
+    for index in (
+        lambda points, of: partition_coefficient(of),
+        lambda points, of: partition_coefficient(of, modified=True),
+        lambda points, of: xie_beni(points, of),
+        lambda points, of: fuzzy_silhouette(points, of),
+    ):
+        # Far points still pull the centers by their small memberships.
+        np.testing.assert_allclose(index(far, beside), index(own, alone), rtol=2e-3)
+
+
 @pytest.mark.parametrize("index", ["vrc", "fuzzy_silhouette", "jump", *SLOW])
 def test_right_number_of_clear_lumps(index):
     for k in (2, 3, 4):

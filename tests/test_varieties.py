@@ -178,6 +178,16 @@ def test_points_of_weight_zero_are_where_they_are(distance):
     np.testing.assert_allclose(jax.grad(total)(w)[5], (4 * one - two - 3 * here) / 2e-4, rtol=1e-6, atol=1e-8)
 
 
+def test_arguments_of_another_kind_are_named():
+    with pytest.raises(TypeError, match="solver must be a Solver, got str"):
+        nfcv(ONE, ALL, solver="anderson")
+    with pytest.raises(TypeError, match="embedding must be a name or several, got 5"):
+        nfcv(ONE, ALL, embedding=5)
+    start = np.concatenate([ALL, ALL * (np.arange(len(ALL)) < 3)[:, None]], axis=1)
+    with pytest.raises(ValueError, match="no column all zero where points have weight, got column 1"):
+        nfcv(ONE, start, weights=np.arange(len(ONE)) >= 3)
+
+
 def test_weights_count_points():
     counts = np.random.default_rng(6).permutation(np.repeat([0, 1, 2, 1], 35))
     options = {"embedding": "cylinder", "noise_distance": 0.3, "solver": TIGHT}
