@@ -22,6 +22,7 @@ from jaxfuzzy.fcm import memberships as memberships
 from jaxfuzzy.ground import find_ground as find_ground
 from jaxfuzzy.ground import upright as upright
 from jaxfuzzy.matcher import Matcher as Matcher
+from jaxfuzzy.photos import read_disparity as read_disparity
 from jaxfuzzy.photos import rectify as rectify
 from jaxfuzzy.primitives import Box as Box
 from jaxfuzzy.primitives import Cone as Cone
@@ -30,7 +31,9 @@ from jaxfuzzy.primitives import Plane as Plane
 from jaxfuzzy.primitives import Quadric as Quadric
 from jaxfuzzy.primitives import Sphere as Sphere
 from jaxfuzzy.recover import recover as recover
+from jaxfuzzy.reproject import cloud_from_depth as cloud_from_depth
 from jaxfuzzy.reproject import cloud_from_disparity as cloud_from_disparity
+from jaxfuzzy.reproject import measure_noise as measure_noise
 from jaxfuzzy.rig import Rig as Rig
 from jaxfuzzy.rig import load_rig as load_rig
 from jaxfuzzy.rig import save_rig as save_rig

@@ -34,6 +34,7 @@ MODEL = """examples:
   jaxfuzzy model left.png right.png --rig calib.txt
   jaxfuzzy model left.png right.png --rig rig.json -k 1:4 --kinds box,cylinder --out found
   jaxfuzzy model left.png right.png --rig intrinsics.yml --rig extrinsics.yml --unit 0.001
+  jaxfuzzy model left.png right.png --rig calib.txt --disparity raft.pfm
   jaxfuzzy model left.png right.png --rig rig.json --json --quiet | jq '.shapes[].kind'"""
 SHAPES = """examples:
   jaxfuzzy shapes cloud.ply
@@ -94,6 +95,7 @@ def _scene(command: argparse.ArgumentParser) -> None:
         metavar="M",
         help="farther than this from a surface is noise, in metres, or auto (default)",
     )
+    add("--up", type=_or_auto(_direction), metavar="X,Y,Z", help="the vertical direction, or auto (default)")
     add("--kinds", type=_kinds, metavar="KIND,...", help=f"kinds to try (default: {','.join(KINDS)})")
     add("--paper", dest="rule", action="store_const", const="paper", help="the paper's own rules for number and kind")
 
@@ -118,13 +120,26 @@ def _model(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="go on where the file holds no baseline; lengths mean nothing then",
     )
+    add("--resized", action="store_true", help="the images were resized since the rig was made: scale it to them")
+    add(
+        "--disparity",
+        type=Path,
+        metavar="FILE",
+        help="disparities of the left image from another matcher, in place of matching: PFM, PNG, TIFF, NPY or NPZ",
+    )
+    add(
+        "--disparity-scale",
+        type=_length,
+        default=1.0,
+        metavar="N",
+        help="what that file's numbers are divided by, such as 16 or 256 (default: 1)",
+    )
     _scene(command)
 
 
 def _shapes(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("cloud", type=Path, metavar="CLOUD", help="PLY, PCD, NPY, NPZ, CSV or XYZ, in metres")
-    add("--up", type=_or_auto(_direction), metavar="X,Y,Z", help="the vertical direction, or auto (default)")
     add(
         "--camera",
         type=_camera,

@@ -72,12 +72,18 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _model(args: argparse.Namespace) -> int:
+    from jaxfuzzy.photos import read_disparity, read_grey
     from jaxfuzzy.rig import load_rig
 
     if len(args.rig) > 2:
         raise ValueError(f"--rig takes one or two files, got {len(args.rig)}")
     rig = load_rig(*args.rig, unit_m=args.unit, rectified=args.rectified, arbitrary_units=args.arbitrary_units)
-    return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **options))
+    if args.resized:
+        rig = rig.scaled(read_grey(args.left, "left").shape[::-1])
+    ready = {}
+    if args.disparity is not None:
+        ready["disparity_px"] = read_disparity(args.disparity, scale=args.disparity_scale)
+    return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **ready, **options))
 
 
 def _shapes(args: argparse.Namespace) -> int:

@@ -21,8 +21,10 @@ class Matcher:
     Attributes:
         method: "sgbm" (semi-global, three directions), "hh" (all directions: smoother fractions, several times slower)
             or "bm" (block matching: only where there is texture).
-        min_disparity: Smallest disparity to search, whole pixels; None takes it from the scene.
-        disparities: How many disparities to search, a multiple of 16; None takes it from the scene.
+        min_disparity: Smallest disparity to search, whole pixels; None takes it from the scene. Neither it nor the number costs
+            columns at a side of the picture, as they do in bare OpenCV: images are padded.
+        disparities: How many disparities to search, a multiple of 16; None takes it from the scene. What lies outside a range
+            that is too small is not only missing: it is matched wrongly. A warning says so.
         block: Side of the matched block, odd, up to 11; up to 51 for "bm", which uses at least 15. Larger ones fatten edges.
         smoothness: Price of a disparity step of one pixel and of more, per channel and pixel of the block. The first holds slanted
             sides flat: at the usual 8 a ball comes out with 3.7 % too large a radius, at 5 with 2.1 %, and on twelve real scenes as

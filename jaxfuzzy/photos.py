@@ -46,7 +46,7 @@ def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
     if rig.image_size is not None and (width, height) != rig.image_size:
         raise ValueError(
             f"images must have the size the rig is for, {rig.image_size[0]} x {rig.image_size[1]}, got {width} x"
-            f" {height}; rig.scaled(({width}, {height})) makes the rig of resized images"
+            f" {height}; rig.scaled(({width}, {height})), or --resized, makes the rig of resized images"
         )
     if images[0].dtype != images[1].dtype:
         raise ValueError(f"left and right must have the same type, got {images[0].dtype} and {images[1].dtype}")

@@ -25,6 +25,7 @@ from jaxfuzzy.outline import sight_of, without_seen_through
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.pieces import without_pieces
 from jaxfuzzy.primitives import Plane
+from jaxfuzzy.reproject import cloud_from_disparity
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.rivals import chosen_by_outline
 from jaxfuzzy.segment import Segmentation, segment
@@ -114,6 +115,7 @@ def model_scene(
     rig: Rig,
     *,
     matcher: Matcher | None = None,
+    disparity_px: Any = None,
     progress: Progress | None = None,
     **options: Any,
 ) -> Scene:
@@ -124,6 +126,8 @@ def model_scene(
         right: The right image, of the same size.
         rig: The cameras.
         matcher: How to match.
+        disparity_px: Disparities (H, W) of the left image from any other matcher, in pixels, not finite where unknown; the images
+            are then not matched. `read_disparity` reads one.
         progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
         **options: Those of `model_cloud`.
 
@@ -139,9 +143,12 @@ def model_scene(
     clock = _Clock(progress)
     with clock.stage("matching"):
         image, image_right = read_pair(left, right, rig)
-        if not rig.rectified:
-            image, image_right, rig = rectify(image, image_right, rig)
-        cloud = reconstruct(image, image_right, rig, matcher=matcher)
+        if disparity_px is not None:
+            cloud = cloud_from_disparity(disparity_px, np.isfinite(disparity_px), rig, image=image)
+        else:
+            if not rig.rectified:
+                image, image_right, rig = rectify(image, image_right, rig)
+            cloud = reconstruct(image, image_right, rig, matcher=matcher)
     scene = _model(cloud, clock, **options)
     return dataclasses.replace(scene, image=_as_rgb(image), image_right=_as_rgb(image_right), rig=rig)
 
@@ -152,7 +159,8 @@ def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: An
     Args:
         cloud: The points, in metres.
         progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
-        **options: `up`: the vertical direction (3,), either sign, or "auto" to take it from the supporting plane.
+        **options: `up`: the vertical direction (3,), either sign, or "auto" to take it from the supporting plane. A plane that
+            leans from a given one by more than 8.6 degrees is none that things stand on.
             `ground`: "auto" to look for a supporting plane and to leave out what belongs to it; None where the cloud has none,
             which needs `up`. `camera`: where the points were seen from (3,), the origin by default; None where not known.
             `ks`: numbers of objects allowed, as in `segment`. `kinds`, `distance`, `noise_distance`, `weights`: as in `fit_shape`.

@@ -55,7 +55,8 @@ SENTENCES: dict[Status, str] = {
     Status.EMPTY: "A cluster has no share of any point that rounding leaves, and its center stays where it was put: give other"
     " seeds, ask for fewer clusters, or take m nearer to 2.",
     Status.SPIKE: "A center sits on an isolated point and its size shrinks at no cost: give a noise_distance.",
-    Status.ALL_NOISE: "No point belongs to a cluster more than to noise: raise noise_distance.",
+    Status.ALL_NOISE: "No point belongs to a cluster or surface more than to noise: raise noise_distance, or lower it where it is"
+    " as large as what it is to tell apart.",
     Status.TOO_FEW_POINTS: "Too few points with weight for what was asked: give more points or ask for less.",
     Status.DEGENERATE: "The points do not span the space (all equal, on one line or in one plane).",
     Status.UNDER_DETERMINED: "The points do not determine this surface: its two smallest eigenvalues are too close; use a"
@@ -66,8 +67,8 @@ SENTENCES: dict[Status, str] = {
     Status.PAPER_DISAGREES: "The paper's most-points rule names another kind than the distance to the surface does.",
     Status.MAY_BE_BOX: "A single flat face: it may be one side of a box whose other sides were not seen.",
     Status.LOWER_BOUND: "An extent was not seen to its end: the size given is a lower bound.",
-    Status.NO_GROUND: "No supporting plane was found: the camera's own frame was used, or the vertical that objects agree on;"
-    " give up=(x, y, z) if you know it.",
+    Status.NO_GROUND: "No supporting plane was found: the vertical that was given was used, or that objects agree on, or the"
+    " camera's own frame; give up=(x, y, z) if you know it, within 8 degrees of the plane's normal.",
     Status.GROUND_SLAB: "The supporting plane's residual is larger than the depth noise: it may be a slab through clutter.",
     Status.ARBITRARY_UNITS: "The rig has no known baseline or offset: lengths are in arbitrary units.",
     Status.MISALIGNED: "Rows of the two images do not match: rectify the pair or check the calibration.",

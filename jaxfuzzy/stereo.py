@@ -3,9 +3,13 @@
 Matching is semi-global (Hirschmüller, PAMI 2008) as OpenCV has it, with what its users stumble over taken care of:
 disparities come in pixels, not in sixteenths; what was not matched is masked, not a point behind the camera; the left
 strip that the matcher cannot answer is regained by padding; both images are matched and compared.
+
+What is used of OpenCV is the same from 4.10 to 5.0. Two of its wheels in one environment (with and without "contrib" or
+"headless") write over each other, and then `cv2` lacks names: keep one.
 """
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +34,7 @@ BM_BLOCK = 15  # block matching needs more to tell places apart
 SIXTEENTHS = 16  # OpenCV's fixed point: disparities are int16, 16 a pixel
 COARSE_WIDTH = 320  # the disparity range is looked for on images no wider than this
 RANGE_SHARE = 0.002  # share of coarse matches left out at either end of the range
+MISSED_SHARE = 0.1  # of coarse matches outside a range that was given, from which on that is told
 WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
 
 
@@ -168,10 +173,23 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
     top = width / 2 if rig.max_disparity_px is None else min(rig.max_disparity_px, width)
     bottom = -min(max(rig.doffs_px, -top), width / 8)
     if low is not None:
-        bottom = float(low)
-    if low is not None and count is not None:
-        top = float(low + count)
-    first, last, to_left = _coarse(left, right, matcher, bottom, top)
+        bottom, top = min(bottom, float(low)), max(top, float(low + (count or 0)))
+    found, shrink, to_left = _coarse(left, right, matcher, bottom, top)
+    first, last = bottom, top
+    if len(found):
+        # One coarse pixel of play at either end, and one more for the rounding of the coarse disparities themselves.
+        skip = int(RANGE_SHARE * len(found))
+        first, last = max(found[skip] - 2 * shrink, bottom), min(found[-1 - skip] + 2 * shrink, top)
+        if count is not None:
+            begin = float(first) if low is None else low
+            missed = np.mean((found < begin - shrink) | (found >= begin + count + shrink))
+            if missed > MISSED_SHARE:
+                warnings.warn(
+                    f"disparities of {begin:.0f} to {begin + count:.0f} px are searched, but {100 * missed:.0f} % of the picture"
+                    f" has others, from {found[skip]:.0f} to {found[-1 - skip]:.0f}: what lies there is missing, or wrong",
+                    stacklevel=2,
+                )
+    first, last = int(np.floor(first)), int(np.ceil(last))
     low = first if low is None else low
     count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
     check(count)
@@ -179,8 +197,8 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
     return low, count, to_left
 
 
-def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: float) -> tuple[int, int, Line]:
-    """The first and last disparity between two bounds that a match of shrunk images shows, and the levels of what matches."""
+def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: float) -> tuple[np.ndarray, int, Line]:
+    """Disparities between two bounds, in order, of a match of shrunk images; how much these are; and the levels of what matches."""
     width = left.shape[1]
     shrink = -(-width // COARSE_WIDTH)
     size = (max(1, width // shrink), max(1, left.shape[0] // shrink))
@@ -192,16 +210,13 @@ def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: flo
     coarse = dataclasses.replace(matcher, method="sgbm", block=3)
     values = _match(one, other, low, count, coarse)
     mirrored = _match(other[:, ::-1], one[:, ::-1], low, count, coarse)[:, ::-1]
-    valid = _without_speckles(values, (values >= low) & _agrees(values, mirrored, low, 1.0), 20)
+    valid = (values >= low) & _agrees(values, mirrored, low, 1.0) & _textured(small[0])
+    valid = _without_speckles(values, valid, 20)
     if valid.sum() < FEWEST_POINTS:
-        return int(np.floor(bottom)), int(np.ceil(top)), UNCHANGED
+        return np.zeros(0), shrink, UNCHANGED
     at = np.flatnonzero(valid)
     to_left = line_between(levels[1][at - np.rint(values.ravel()[at]).astype(int)], levels[0][at])
-    found = np.sort(values[valid]) * shrink
-    skip = int(RANGE_SHARE * len(found))
-    # One coarse pixel of play at either end, and one more for the rounding of the coarse disparities themselves.
-    first, last = found[skip] - 2 * shrink, found[-1 - skip] + 2 * shrink
-    return int(np.floor(max(first, bottom))), int(np.ceil(min(last, top))), to_left
+    return np.sort(values[valid]) * shrink, shrink, to_left
 
 
 def _match(left: Image, right: Image, low: int, count: int, matcher: Matcher) -> np.ndarray:

@@ -397,6 +397,21 @@ def test_calibrate(run, shared_data):
     assert json.loads(out)["image_size"] == [640, 480]
 
 
+def test_ready_disparities_and_resized_pictures_reach_the_pipeline(run, modelled):
+    pictures(128, 96)
+    np.save("map.npy", np.full((96, 128), 160.0))
+    words = ("model", "left.png", "right.png", "--rig", "rig.json", "--resized", "--up", "0,-1,0")
+    assert run(*words)[0] == 0
+    assert modelled["inputs"][2].image_size == (128, 96)
+    assert modelled["inputs"][2].focal_px == (120.0, 120.0)
+    assert modelled["options"] == {"up": (0.0, -1.0, 0.0)}
+    assert run(*words, "--disparity", "map.npy", "--disparity-scale", "16")[0] == 0
+    assert (modelled["options"]["disparity_px"] == 10).all()
+    status, _, err = run(*words, "--disparity", "none.pfm")
+    assert status == 2
+    assert "disparity not found: none.pfm" in last_line(err)
+
+
 def test_no_photograph_is_overwritten(run, tmp_path):
     pictures()
     before = Path("left.png").read_bytes()

@@ -158,6 +158,16 @@ def test_specks_of_table_and_wall_are_no_objects(tilt, seed):
     assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
 
 
+def test_disparities_of_another_matcher_take_the_place_of_matching(paper_pair):
+    truth = np.where(paper_pair.visible, paper_pair.disparity_px, np.nan)
+    scene = model_scene(paper_pair.left, paper_pair.right, paper_pair.rig, disparity_px=truth)
+    assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
+    assert float(scene.shapes[0].primitive.radius) == pytest.approx(0.045, abs=1e-4)
+    assert scene.image is not None
+    with pytest.raises(ValueError, match="disparity_px must have the rig's size"):
+        model_scene(paper_pair.left, paper_pair.right, paper_pair.rig, disparity_px=truth[:100])
+
+
 def test_arguments_of_another_kind_are_named(paper_pair):
     points = np.random.default_rng(0).normal(size=(200, 3)) + [0, 0, 5]
     with pytest.raises(TypeError, match=r"cloud must be a Cloud, got ndarray; Cloud\(points\) makes one"):

@@ -402,6 +402,11 @@ def test_range_comes_from_the_scene():
         assert low + count > np.percentile(seen, 99.7)
         assert count <= 2 * (seen.max() - seen.min()) + 32
     assert search_range(picture.left, picture.right, picture.rig, Matcher(min_disparity=5, disparities=48)) == (5, 48)
+    # Too small a range: what lies outside is matched wrongly, so it is told.
+    with pytest.warns(
+        UserWarning, match=r"disparities of 5 to 21 px are searched, but \d+ % of the picture has others, from"
+    ):
+        search_range(picture.left, picture.right, picture.rig, Matcher(min_disparity=5, disparities=16))
     low, count = search_range(picture.left, picture.right, picture.rig, Matcher(min_disparity=5))
     assert low == 5
     assert low + count > np.percentile(seen, 99.7)
