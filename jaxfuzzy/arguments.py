@@ -95,7 +95,12 @@ def _scene(command: argparse.ArgumentParser) -> None:
         metavar="M",
         help="farther than this from a surface is noise, in metres, or auto (default)",
     )
-    add("--up", type=_or_auto(_direction), metavar="X,Y,Z", help="the vertical direction, or auto (default)")
+    add(
+        "--up",
+        type=_or_auto(_direction),
+        metavar="X,Y,Z",
+        help="the vertical direction, such as 0,0,1; auto (default) has y down",
+    )
     add("--kinds", type=_kinds, metavar="KIND,...", help=f"kinds to try (default: {','.join(KINDS)})")
     add("--paper", dest="rule", action="store_const", const="paper", help="the paper's own rules for number and kind")
 

@@ -1,14 +1,17 @@
 """The command line: stereo pairs, clouds, tables and calibration boards in; results on disk and a short table out.
 
 Results go to standard output, everything else to standard error. Exit status: 0 done, 1 the data could not be modelled,
-2 wrong use or unreadable input, 130 stopped by Ctrl-C.
+2 wrong use or unreadable input, 130 stopped by Ctrl-C or by being asked to end.
 """
 
 import argparse
 import json
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as done:  # argparse has said why
         return int(done.code or 0)
     try:
-        with warnings_as_lines():
+        with warnings_as_lines(), _stopped_in_order():
             _set_up_process()
             status: int = args.run(args)
             sys.stdout.flush()
@@ -89,6 +92,8 @@ def _model(args: argparse.Namespace) -> int:
 def _shapes(args: argparse.Namespace) -> int:
     from jaxfuzzy.cloud import read_cloud
 
+    if args.no_ground and args.up in (None, "auto"):
+        raise ValueError("--no-ground needs --up X,Y,Z: without a table there is nothing to take the vertical from")
     cloud = read_cloud(args.cloud)
     return _scene(args, lambda **options: _modelling().model_cloud(cloud, **options))
 
@@ -267,6 +272,19 @@ def _modelling() -> Any:
     from jaxfuzzy import scene
 
     return scene
+
+
+@contextmanager
+def _stopped_in_order() -> Iterator[None]:
+    """Takes being asked to end for Ctrl-C, so that nothing half-written is left behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _set_up_process() -> None:

@@ -51,8 +51,8 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         FileNotFoundError: There is no such file.
         ValueError: It is in none of these formats, damaged, cut short, or holds no finite point.
     """
+    data = read_bytes(path, "cloud")
     try:
-        data = read_bytes(path, "cloud")
         columns = cloudfiles.parse(data)
         # Some write their names in capitals.
         columns = {name.lower(): values for name, values in columns.items() if name != name.lower()} | columns

@@ -38,7 +38,7 @@ PEAK_SIGMAS = 6.0
 # counts in its own support, so that above no background one alone is an outlier and one with a neighbour is none.
 SPARSE, SPARSE_SIGMAS = 0.2, 2.2
 # Places and queries that meet at a time.
-BLOCK, QUERIES = 512, 64
+BLOCK, QUERIES = 128, 128
 
 
 @record

@@ -119,7 +119,8 @@ def fcm(
         m: Fuzzifier, above 1.
         sizes: Whether to learn the sizes (eq. 11); otherwise all are 1/K.
         noise_distance: Distance of the noise cluster from every point, in the unit of the points; a `NoiseRule` to take it from the
-            data; None for no noise cluster.
+            data; None for no noise cluster. Of many points in single precision distances below a thousandth of their spread are
+            rounding: for a smaller noise distance take double precision.
         weights: Weight of each point (N,), not negative: weight 2 is the point twice, weight 0 the point absent, though it has
             memberships too.
         memberships: Whether to make memberships, noise and labels; without them nothing of size N × K ever exists.

@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfuzzy.arrays import lengths, on_device
-from jaxfuzzy.looks import side_by_side
+from jaxfuzzy.arrays import lengths, nth_smallest, on_device
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -78,12 +77,12 @@ def with_hidden_ends(
         thickness: How far above it points were taken for its own.
     """
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
-    sights = side_by_side(lambda own: _sight_of(camera, points, own), on)
+    seen = [_seen_from(camera, points, own) for own in on]
+    sights = [_sight(ray, depth, _reach(ray)) for ray, depth in seen]
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
     outliers = _sight(*_seen_from(camera, points, rest), 0.0)
-
-    def told(k: int) -> Shape:
-        shape = shapes[k]
+    told = []
+    for k, shape in enumerate(shapes):
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
         loose = outliers._replace(reach=sights[k].reach)
         before = [*(s for i, s in enumerate(sights) if i != k), loose]
@@ -92,16 +91,15 @@ def with_hidden_ends(
             for end in ends_of(shape.primitive)
             if not _rests(end, ground, thickness) and _hidden(end, shape, sights[k], before, camera)
         }
-        if not hidden:
-            return shape
-        body = shape.primitive
-        if isinstance(body, Box):
-            seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
-            body = dataclasses.replace(body, seen=on_device(seen))
-        status = on_device(int(shape.status) | Status.LOWER_BOUND, np.int32)
-        return dataclasses.replace(shape, primitive=body, status=status)
-
-    return tuple(side_by_side(told, range(len(shapes))))
+        if hidden:
+            body = shape.primitive
+            if isinstance(body, Box):
+                seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
+                body = dataclasses.replace(body, seen=on_device(seen))
+            status = on_device(int(shape.status) | Status.LOWER_BOUND, np.int32)
+            shape = dataclasses.replace(shape, primitive=body, status=status)
+        told.append(shape)
+    return tuple(told)
 
 
 def ends_of(body: Primitive | None) -> list[End]:
@@ -146,11 +144,6 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
     return offset / np.maximum(depth, 1e-12)[:, None], depth
 
 
-def _sight_of(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> Sight:
-    ray, depth = _seen_from(camera, points, own)
-    return _sight(ray, depth, _reach(ray))
-
-
 def _sight(ray: np.ndarray, depth: np.ndarray, reach: float) -> Sight:
     middle = ray.mean(axis=0) if len(ray) else np.zeros(3)
     return Sight(ray, depth, reach, middle, float(lengths(ray - middle).max(initial=0.0)))
@@ -161,7 +154,7 @@ def _reach(ray: np.ndarray) -> float:
         return 0.0
     some = ray[np.linspace(0, len(ray) - 1, min(len(ray), SAMPLE)).astype(int)]
     square = np.maximum(2 - 2 * some @ ray.T, 0)
-    return float(np.sqrt(np.median(np.partition(square, NEIGHBOURS, axis=1)[:, NEIGHBOURS])))
+    return float(np.sqrt(np.median(nth_smallest(square, NEIGHBOURS))))
 
 
 def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camera: np.ndarray) -> bool:

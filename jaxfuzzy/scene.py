@@ -159,8 +159,9 @@ def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: An
     Args:
         cloud: The points, in metres.
         progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
-        **options: `up`: the vertical direction (3,), either sign, or "auto" to take it from the supporting plane. A plane that
-            leans from a given one by more than 8.6 degrees is none that things stand on.
+        **options: `up`: the vertical direction (3,), either sign, or "auto" to take it from the supporting plane, which may then
+            lean by up to 50 degrees from the camera's y axis: clouds in a frame with z up need (0, 0, 1). From a given direction
+            it may lean by 8.6 degrees.
             `ground`: "auto" to look for a supporting plane and to leave out what belongs to it; None where the cloud has none,
             which needs `up`. `camera`: where the points were seen from (3,), the origin by default; None where not known.
             `ks`: numbers of objects allowed, as in `segment`. `kinds`, `distance`, `noise_distance`, `weights`: as in `fit_shape`.

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, on_device, record
+from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, nth_smallest, on_device, record
 from jaxfuzzy.density import DELTA, PROTOTYPES, SWEEPS, part
 from jaxfuzzy.fcm import Partition, fcm
 from jaxfuzzy.linalg import tangents
@@ -224,7 +224,7 @@ def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     probes = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), PROBES)).astype(int)]
     neighbour = min(NEIGHBOUR, len(crowd) - 1)
     square = (probes**2).sum(axis=1)[:, None] + (crowd**2).sum(axis=1) - 2 * probes @ crowd.T
-    reach = np.sqrt(np.maximum(np.partition(square, neighbour, axis=1)[:, neighbour], 0))
+    reach = np.sqrt(np.maximum(nth_smallest(square, neighbour), 0))
     usual = np.quantile(reach, QUANTILE)
     # `neighbour` points within a disc of this radius: so much surface has each of the points that lie on a surface.
     area = np.pi * usual**2 / max(neighbour, 1) * (reach <= ALONE * usual).mean() * len(crowd)

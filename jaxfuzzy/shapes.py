@@ -307,18 +307,16 @@ def with_quadrics(
         weights: Weight of each point (N,).
     """
     weight = np.ones(len(points)) if weights is None else np.asarray(weights, float)
-
-    def told(k: int) -> Shape:
-        own, shape = members[k], shapes[k]
-        if shape.primitive is not None or int(shape.status) & NO_QUADRIC != Status.REFUSED:
-            return shape
-        found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
-        if found is None:
-            return shape
-        quadric = jax.tree.map(lambda a: on_device(a, points.dtype), found[0])
-        return dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jax.device_put(found[1]))
-
-    return tuple(side_by_side(told, range(len(shapes))))
+    told = []
+    for own, shape in zip(members, shapes, strict=True):
+        found = None
+        if shape.primitive is None and int(shape.status) & NO_QUADRIC == Status.REFUSED:
+            found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
+        if found is not None:
+            quadric = jax.tree.map(lambda a: on_device(a, points.dtype), found[0])
+            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jax.device_put(found[1]))
+        told.append(shape)
+    return tuple(told)
 
 
 def refused(shape: Shape, status: Status, why: str) -> Shape:

@@ -256,7 +256,7 @@ def test_bad_clouds(run, tmp_path):
         (("two.csv",), 2, "must have at least three columns"),
         (("objects.npy",), 2, "holds Python objects"),
         (("few.xyz", "--up", "0,0,0"), 2, "must be three numbers such as 0,-1,0, not all 0, got '0,0,0'"),
-        (("few.xyz", "--no-ground"), 2, "up must be given"),
+        (("few.xyz", "--no-ground"), 2, "--no-ground needs --up X,Y,Z"),
         (("few.xyz", "--camera", "1,2"), 2, "must be three numbers such as 0,0,1.5, or none, got '1,2'"),
         (("few.xyz", "--up", "0,1,0", "--no-ground"), 1, "9 of 9 points"),
     ):
@@ -536,14 +536,15 @@ def interrupts():
 
 
 @pytest.mark.usefixtures("interrupts")
-def test_ctrl_c_in_a_real_process(tmp_path):
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_being_stopped_in_a_real_process(tmp_path, how):
     command = [sys.executable, "-m", "jaxfuzzy.cli", "demo", "--out", "found"]
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment(tmp_path), stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stderr.readline() == "jaxfuzzy: matching\n"
         time.sleep(0.5)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(how)
         rest = process.stderr.read()
         assert process.wait(300) == 130
     assert "Traceback" not in rest
