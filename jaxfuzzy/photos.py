@@ -17,9 +17,7 @@ Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
 SMALLEST = 32
 ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
 LEAST_SHARE = 0.2  # of matched features that must agree: real pairs 0.24 to 0.95, repeating patterns at wrong rows 0.15
-SURE_SHARE = (
-    0.4  # from which on it is told how rows differ over the picture: real pairs 0.43 and more but for a dark one
-)
+SURE_SHARE = 0.4  # from which on it is told how rows differ over the picture: real pairs 0.43 and more, but a dark one
 BRIGHTEST = 0.999  # this quantile of more than 8 bits becomes white: a few hot pixels would make all others dark
 
 
