@@ -65,3 +65,15 @@ def test_varieties_find_lines():
     slopes = np.sort(np.abs(fitted.components_[:, 0, 0]))
     np.testing.assert_allclose(slopes, np.sort([10, 1] / np.sqrt(101)), atol=5e-3)
     np.testing.assert_array_equal(fitted.predict(x), fitted.labels_)
+
+
+@pytest.mark.parametrize(
+    "estimator", [FuzzyCMeans(2, noise_distance=3.0), FuzzyVarieties(1), FuzzyVarieties(1, noise_distance=0.5)]
+)
+def test_what_was_held_out_is_predicted_as_by_the_fit(estimator):
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.normal(size=(30, 3)), rng.normal(size=(20, 3)) + [6, 0, 0]])
+    weight = (np.arange(50) % 4 > 0).astype(float)
+    fitted = estimator.fit(x, sample_weight=weight)
+    np.testing.assert_array_equal(fitted.labels_, fitted.predict(x))
+    np.testing.assert_allclose(fitted.memberships_, fitted.transform(x), atol=1e-12)
