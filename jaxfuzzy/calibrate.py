@@ -200,8 +200,11 @@ def _views(
             continue
         (left, left_numbers), (right, right_numbers) = found
         both, at_left, at_right = np.intersect1d(left_numbers, right_numbers, return_indices=True)
-        if len(both) < 6 or _on_a_line(find.places[both]):
-            left_out.append((pair, "fewer than 6 corners, or only some on one line, seen by both cameras"))
+        if len(both) < 6:
+            left_out.append((pair, "fewer than 6 corners seen by both cameras"))
+            continue
+        if _on_a_line(find.places[both]):
+            left_out.append((pair, "all corners seen by both cameras lie on one line"))
             continue
         left, right = left[at_left], right[at_right]
         # A board whose corners look the same upside down may be counted from either end. Cameras side by side are not
