@@ -17,7 +17,8 @@ Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
 SMALLEST = 32
 ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
 LEAST_SHARE = 0.2  # of matched features that must agree: real pairs 0.24 to 0.95, repeating patterns at wrong rows 0.15
-SURE_SHARE = 0.4  # from which on it is told how rows differ over the picture: real pairs 0.43 and more, but a dark one
+# How rows differ over the picture is told from so many features and such a share on: fewer, of a chart, lay on a wrong plane.
+SURE_FEATURES, SURE_SHARE = 100, 0.4
 BRIGHTEST = 0.999  # this quantile of more than 8 bits becomes white: a few hot pixels would make all others dark
 
 
@@ -203,7 +204,7 @@ def alignment(left: Image, right: Image) -> Alignment:
     across, down = x - right_x, right_y - y
     where = np.stack([np.ones_like(x), 2 * x / left.shape[1] - 1, 2 * y / left.shape[0] - 1], axis=1)
     plane, good = _rows(where, down, 2.5 * shrink)
-    if good.mean() < SURE_SHARE:
+    if good.sum() < max(SURE_FEATURES, SURE_SHARE * len(pairs)):
         plane, good = _rows(where[:, :1], down, 2.5 * shrink)
     if good.sum() < max(FEWEST_FEATURES, LEAST_SHARE * len(pairs)):
         return UNKNOWN

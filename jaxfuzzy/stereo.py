@@ -29,7 +29,7 @@ from jaxfuzzy.status import Status
 MODES = {"sgbm": cv2.StereoSGBM_MODE_SGBM_3WAY, "hh": cv2.StereoSGBM_MODE_HH}
 FEWEST_POINTS = 50
 FEW_MATCHES_SHARE = 0.1
-MISALIGNED_PX = 0.75  # rows may differ by less without harm
+MISALIGNED_PX, ROLLED_PX = 0.75, 1.0  # rows may differ by less without harm, on the whole and in a corner
 BM_BLOCK = 15  # block matching needs more to tell places apart
 SIXTEENTHS = 16  # OpenCV's fixed point: disparities are int16, 16 a pixel
 COARSE_WIDTH = 320  # the disparity range is looked for on images no wider than this
@@ -68,7 +68,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
             f"only {count} of {valid.size} pixels were matched, {FEWEST_POINTS} are needed: check that the images are"
             f" rectified ({rows}), the range of disparities, and that there is texture"
         )
-    status = int(Status.MISALIGNED) * (max(abs(found.rows_px), found.corners_px) > MISALIGNED_PX)
+    status = int(Status.MISALIGNED) * (abs(found.rows_px) > MISALIGNED_PX or found.corners_px > ROLLED_PX)
     status |= int(Status.FEW_MATCHES) * (count < FEW_MATCHES_SHARE * valid.size)
     cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=matcher.disparity_std_px)
     return dataclasses.replace(cloud, status=int(cloud.status) | status)
