@@ -102,7 +102,7 @@ def nth_smallest(values: np.ndarray, n: int) -> np.ndarray:
     """
     rows, count = values.shape
     size = int(np.sqrt(count))
-    if count <= 8 * (n + 1):
+    if count <= (n + 2) ** 2:  # no more blocks than that
         return np.asarray(np.partition(values, n, axis=1)[:, n])
     blocks = np.pad(values, ((0, 0), (0, -count % size)), constant_values=np.inf).reshape(rows, -1, size)
     near = np.argpartition(blocks.min(axis=2), n, axis=1)[:, : n + 1]

@@ -186,7 +186,7 @@ def real(value: Any, name: str) -> Any:
     try:
         array = value if isinstance(value, jax.Array | np.ndarray) else np.asarray(value)
     except ValueError:
-        raise ValueError(f"{name} must be rows of one length") from None
+        raise ValueError(f"{name} must have rows of one length, or be one number") from None
     if array.dtype.kind not in "fiub" and not jax.numpy.issubdtype(array.dtype, jax.numpy.floating):
         raise TypeError(f"{name} must be real numbers, got {array.dtype}")
     return array

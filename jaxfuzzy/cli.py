@@ -81,6 +81,8 @@ def _model(args: argparse.Namespace) -> int:
     if len(args.rig) > 2:
         raise ValueError(f"--rig takes one or two files, got {len(args.rig)}")
     rig = load_rig(*args.rig, unit_m=args.unit, rectified=args.rectified, arbitrary_units=args.arbitrary_units)
+    if args.resized and rig.image_size is None:
+        raise ValueError("--resized needs a rig that says how large its images are, which this file does not")
     if args.resized:
         rig = rig.scaled(read_grey(args.left, "left").shape[::-1])
     ready = {}
@@ -277,14 +279,14 @@ def _modelling() -> Any:
 @contextmanager
 def _stopped_in_order() -> Iterator[None]:
     """Takes being asked to end for Ctrl-C, so that nothing half-written is left behind."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield  # somebody else has a say in it
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _set_up_process() -> None:

@@ -270,8 +270,9 @@ def parse_text(data: bytes) -> Columns:
         if table.shape[1] == 6 and np.all((rest >= 0) & (rest <= 255) & (rest == np.round(rest))) and rest.max() > 1:
             columns |= dict(zip(("red", "green", "blue"), rest.T.astype(np.uint8), strict=True))
         return columns
-    names[0] = names[0].removeprefix("//").strip()
-    names = [name for name in names if name]
+    if names[0].startswith("//"):
+        names[0] = names[0].removeprefix("//").strip()
+        names = names[0 if names[0] else 1 :]
     if len(rows) > 2 and len(names) > 1 and rows[1].isdecimal():
         del rows[1]
     if len(rows) < 2:
@@ -381,14 +382,12 @@ def _table(rows: list[str], delimiter: str | None, count: int, *, exact: bool) -
 
 
 def _typed(table: np.ndarray, kinds: list[tuple[str, str]]) -> Columns:
-    """The columns of a table of text, each as the type its header says."""
+    """The columns of a table of text, each as the type its header says where that can hold it."""
     columns = {}
     for values, (name, kind) in zip(table.T, kinds, strict=True):
-        whole = np.dtype(kind).kind != "f"
         with np.errstate(invalid="ignore"):
-            columns[name] = values.astype(kind)
-        if whole and not np.array_equal(columns[name], values):
-            raise ValueError(f"has a {name} that is no {np.dtype(kind)}, as its header says")
+            typed = values.astype(kind)
+        columns[name] = typed if np.dtype(kind).kind == "f" or np.array_equal(typed, values) else values
     return columns
 
 

@@ -122,7 +122,7 @@ def fcm(
             data; None for no noise cluster. Of many points in single precision distances below a thousandth of their spread are
             rounding: for a smaller noise distance take double precision.
         weights: Weight of each point (N,), not negative: weight 2 is the point twice, weight 0 the point absent, though it has
-            memberships too.
+            memberships too (as if it were no farther than 1e6 spreads from the others).
         memberships: Whether to make memberships, noise and labels; without them nothing of size N × K ever exists.
         solver: Steps, tolerance and acceleration.
 

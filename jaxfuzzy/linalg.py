@@ -61,10 +61,10 @@ def weighted_range(values: Float[Array, " N"], weights: Float[Array, " N"], tail
     A few values far out move the ends no further than by as many places in the order of the others; values of weight 0, wherever
     they are, do not move them at all.
     """
-    # Beyond the last value there must be no other, or the ends of few values would lead towards it.
+    # Those come last, at the place of the last that has weight: the ends of few values must not lead towards them.
+    order = jnp.argsort(jnp.where(weights > 0, values, jnp.inf))
     last = jnp.max(jnp.where(weights > 0, values, -jnp.inf))
-    values = jnp.where(weights > 0, values, jnp.where(last > -jnp.inf, last, values))
-    order = jnp.argsort(values)
+    values = jnp.where((weights > 0) | (last == -jnp.inf), values, last)
     heap = jnp.cumsum(weights[order]) - weights[order] / 2
     heap = divide(heap, weights.sum(), 0.5)
     low, high = jnp.interp(jnp.array([tail, 1 - tail], values.dtype), heap, values[order])

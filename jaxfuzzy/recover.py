@@ -55,7 +55,7 @@ def recover(
     Args:
         varieties: What `nfcv` gave in one embedding (`pick` one of several).
         kind: "plane", "cylinder", "cone", "sphere"; "box" from two or three planes, its faces; or "quadric".
-        variety: Which of C varieties; the one of largest total membership where not given. A box takes all of them.
+        variety: Which of C varieties; the one of largest weighted membership where not given. A box takes all of them.
         points: The points (N, 3) of the fit.
         weights: Their weights (N,) in the fit, where they had any.
 

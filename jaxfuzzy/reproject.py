@@ -5,6 +5,7 @@ camera's frame. The standard deviation of z follows from that of the disparity, 
 """
 
 import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from jaxfuzzy.status import Status
 # to 560 rows. The left-right residual and local differences understate it two to nine times. Images with more rows are as sharp,
 # not sharper: at 1,500 rows 0.6 px were measured.
 DISPARITY_STD_PX, MEASURED_ROWS = 0.2, 560
-# What is seen further left than the picture is wide is none; a few columns cut out of one may have larger ones.
+# Disparities above the width of a picture, or above this, are told.
 NARROWEST_PX = 64
 
 
@@ -48,7 +49,7 @@ def cloud_from_disparity(
         The points in row order of their pixels, with colors, `depth_std` and `pixels_px`.
 
     Raises:
-        ValueError: Shapes disagree, disparities are multiples of pixels, or a standard deviation is not above 0.
+        ValueError: Shapes disagree, disparities are OpenCV's fixed point, or a standard deviation is not above 0.
         DataError: No pixel is left.
     """
     disparity = np.asarray(disparity_px)
@@ -61,11 +62,12 @@ def cloud_from_disparity(
     valid = np.isfinite(disparity) & (disparity > 0) if valid is None else _mask(valid, disparity.shape)
     with np.errstate(invalid="ignore"):
         valid = valid & np.isfinite(disparity) & (disparity + rig.doffs_px > 0)
-    largest = float(disparity[valid].max(initial=0))
-    if largest > max(disparity.shape[1], NARROWEST_PX):
-        raise ValueError(
-            f"disparity_px must be in pixels, got {largest:g} in an image {disparity.shape[1]} wide: files hold multiples, 16 of"
-            " them a pixel (OpenCV), 256 (KITTI) or 4 (Middlebury), see read_disparity"
+    widest = max(disparity.shape[1], NARROWEST_PX)
+    if (disparity[valid] > widest).sum() > valid.sum() / 2:
+        warnings.warn(
+            f"disparities are mostly above the {disparity.shape[1]} px that the image is wide: unless it is cut out of a larger"
+            " one they are multiples, 16 of which are a pixel (OpenCV), 256 (KITTI) or 4 (Middlebury), see read_disparity",
+            stacklevel=2,
         )
     scale = rig.focal_px[0] * rig.baseline_m
     depth = np.full_like(disparity, np.nan)

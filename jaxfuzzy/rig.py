@@ -215,7 +215,7 @@ def load_rig(
         if text.lstrip().startswith("{") and '"schema"' in text:
             given = {"other": other is not None, "cameras": cameras is not None, "rectified": rectified}
             if wrong := [name for name, is_given in given.items() if is_given]:
-                raise ValueError(f"is this library's own JSON, which says itself what {' and '.join(wrong)} would")
+                raise ValueError(f"is this library's own JSON, which has no use for {' and '.join(wrong)}")
             rig = _from_json(text, unit)
         else:
             second = None if other is None else _text(other)

@@ -126,8 +126,8 @@ def model_scene(
         right: The right image, of the same size.
         rig: The cameras.
         matcher: How to match.
-        disparity_px: Disparities (H, W) of the left image from any other matcher, in pixels, not finite where unknown; the images
-            are then not matched. `read_disparity` reads one.
+        disparity_px: Disparities (H, W) of the left image from any other matcher, in pixels, not finite or not above 0 where
+            unknown (see `read_disparity`); rectified images are then not matched, and of `matcher` the error of a disparity counts.
         progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
         **options: Those of `model_cloud`.
 
@@ -144,7 +144,8 @@ def model_scene(
     with clock.stage("matching"):
         image, image_right = read_pair(left, right, rig)
         if disparity_px is not None:
-            cloud = cloud_from_disparity(disparity_px, np.isfinite(disparity_px), rig, image=image)
+            std = None if matcher is None else checks.kind(matcher, "matcher", Matcher).disparity_std_px
+            cloud = cloud_from_disparity(disparity_px, None, rig, image=image, disparity_std_px=std)
         else:
             if not rig.rectified:
                 image, image_right, rig = rectify(image, image_right, rig)

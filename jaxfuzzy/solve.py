@@ -192,7 +192,7 @@ def _solve_jvp(
         tangent = [change for on, change in zip(moving, changes, strict=True) if on]
         forced = jax.jvp(of_moving, (primal,), (tangent,))[1]
         response = _pseudo_inverse(jnp.eye(y.size, dtype=y.dtype) - jacobian(y, args))
-        dy = _once(response) @ _once(forced)
+        dy = _once(response) @ forced
     no_tangent = jax.custom_derivatives.zero_from_primal
     return out, (dy, *(no_tangent(value) for value in out[1:]))
 

@@ -32,7 +32,7 @@ FEW_MATCHES_SHARE = 0.1
 MISALIGNED_PX, ROLLED_PX = 0.75, 1.0  # rows may differ by less without harm, on the whole and in a corner
 BM_BLOCK = 15  # block matching needs more to tell places apart
 SIXTEENTHS = 16  # OpenCV's fixed point: disparities are int16, 16 a pixel
-COARSE_WIDTH = 320  # the disparity range is looked for on images no wider than this
+COARSE_WIDTH, COARSE_BLOCK = 320, 3  # the disparity range is looked for on images no wider than this, by such blocks
 RANGE_SHARE = 0.002  # share of coarse matches left out at either end of the range
 MISSED_SHARE = 0.1  # of coarse matches outside a range that was given, from which on that is told
 WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
@@ -180,15 +180,15 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
         # One coarse pixel of play at either end, and one more for the rounding of the coarse disparities themselves.
         skip = int(RANGE_SHARE * len(found))
         first, last = max(found[skip] - 2 * shrink, bottom), min(found[-1 - skip] + 2 * shrink, top)
-        if count is not None:
-            begin = float(first) if low is None else low
-            missed = np.mean((found < begin - shrink) | (found >= begin + count + shrink))
-            if missed > MISSED_SHARE:
-                warnings.warn(
-                    f"disparities of {begin:.0f} to {begin + count:.0f} px are searched, but {100 * missed:.0f} % of the picture"
-                    f" has others, from {found[skip]:.0f} to {found[-1 - skip]:.0f}: what lies there is missing, or wrong",
-                    stacklevel=2,
-                )
+        begin = float(first) if low is None else float(low)
+        end = np.inf if count is None else begin + count
+        missed = np.mean((found < begin - shrink) | (found >= end + shrink))
+        if missed > MISSED_SHARE:
+            warnings.warn(
+                f"disparities of {begin:.0f} to {min(end, last):.0f} px are searched, but {100 * missed:.0f} % of the picture has"
+                f" others, from {found[skip]:.0f} to {found[-1 - skip]:.0f}: what lies there is missing, or wrong",
+                stacklevel=2,
+            )
     first, last = int(np.floor(first)), int(np.ceil(last))
     low = first if low is None else low
     count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
@@ -207,7 +207,9 @@ def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: flo
     one, other = evened(small[0], small[1], line_between(levels[1], levels[0]))
     low = int(np.floor(bottom / shrink))
     count = STEP * max(1, int(np.ceil((top / shrink - low) / STEP)))
-    coarse = dataclasses.replace(matcher, method="sgbm", block=3)
+    # Prices for other blocks may be too high for these.
+    prices = matcher.smoothness if matcher.method != "bm" and matcher.block >= COARSE_BLOCK else Matcher.smoothness
+    coarse = dataclasses.replace(matcher, method="sgbm", block=COARSE_BLOCK, smoothness=prices)
     values = _match(one, other, low, count, coarse)
     mirrored = _match(other[:, ::-1], one[:, ::-1], low, count, coarse)[:, ::-1]
     valid = (values >= low) & _agrees(values, mirrored, low, 1.0) & _textured(small[0])

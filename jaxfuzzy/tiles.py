@@ -94,7 +94,7 @@ class Tiles:
     """Points in tiles, in units where their weighted mean is 0 and their RMS distance from it is 1.
 
     Attributes:
-        blocks: Tiles of points, one a column: coordinates, squared length, 1. Padding points lie at 0.
+        blocks: Tiles of points, one a column: coordinates, squared length, 1. Where padding lies is of no account.
         weights: Weight of each point; padding has 0. None where all points weigh the same, on one device.
         mean: What was taken off, in the input's units.
         scale: What was divided by; 1 where all points are equal.

@@ -103,8 +103,8 @@ def tune(
     checks.integer(steps, "steps", at_least=1)
     if not callable(loss):
         raise TypeError(f"loss must be a function of a Hyper, got {loss!r}")
-    if solver is not None:
-        checks.kind(solver, "solver", optx.AbstractMinimiser)
+    if not isinstance(solver, optx.AbstractMinimiser | None):
+        raise TypeError(f"solver must be a minimiser of optimistix, got {solver!r}")
     start = _checked(start)
     dtype = jnp.result_type(*jax.tree.leaves(start))
     start = jax.tree.map(lambda leaf: leaf.astype(dtype), start)

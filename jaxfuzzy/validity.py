@@ -258,7 +258,7 @@ def _jumps(points: Array, partitions: Partition, weights: Array | None) -> Float
 def xie_beni(points: ArrayLike, partition: Partition, *, weights: ArrayLike | None = None) -> Float[Array, ""]:
     """Xie and Beni's index (1991): mean of u^m D over the smallest squared distance of two centers; lower is better.
 
-    Points that belong to noise most are left out.
+    Points that belong to noise most are left out; where all do it is not a number.
 
     Args:
         points: The points (N, D) of the fit.
@@ -290,7 +290,7 @@ def partition_coefficient(
 ) -> Float[Array, ""]:
     """Partition coefficient (Bezdek 1981): the mean of the summed squared memberships, 1/K to 1; higher is crisper.
 
-    Points that belong to noise most are left out.
+    Points that belong to noise most are left out; where all do it is not a number.
 
     Args:
         partition: A partition with its memberships.

@@ -75,7 +75,8 @@ def nfcv(
             unit of the embedding with the algebraic one. None: no noise cluster, which is plain fuzzy c-varieties.
         m: Fuzzifier, above 1.
         distance: "geometric" or "algebraic"; see above. The algebraic one takes the coordinates as they are, uncentered.
-        weights: Weight of each point (N,), not negative: weight 2 is the point twice, weight 0 the point absent.
+        weights: Weight of each point (N,), not negative: weight 2 is the point twice, weight 0 the point absent, though it has
+            memberships too (as if it were no farther than 1,000 spreads from the others).
         solver: Steps, tolerance and acceleration. The geometric step is never accelerated: with no objective to guard it, an
             accelerated step may circle where the plain one passes.
 
@@ -138,10 +139,10 @@ def nfcv(
     memberships = _start(start, count, len(names))
     checks.noise_distance(noise_distance, count)
     weights = checks.weights(weights, count)
-    if weights is not None and is_concrete(memberships) and is_concrete(weights):
-        held = (np.asarray(memberships) * (np.asarray(weights) > 0)[:, None]).max(axis=(0, 1))
-        if not np.all(held > 0):
-            empty = int(np.argmin(held > 0))
+    if weights is not None and not isinstance(start, Varieties) and is_concrete(memberships) and is_concrete(weights):
+        held = np.asarray(memberships[0])[np.asarray(weights) > 0].max(axis=0) > 0
+        if not held.all():
+            empty = int(np.argmin(held))
             raise ValueError(f"start must leave no column all zero where points have weight, got column {empty} so")
     parts = Parts.of(points, solver.mesh)
     points = points if parts is None else parts.place(points)

@@ -100,9 +100,13 @@ def pose(
         back, forward = (table @ change @ unmixed(table).T for change in (matrix, inverse))
         place = Frame(table @ constant + back @ middle, back, forward, unit)
     else:
-        here, reach = lax.stop_gradient(frame(points, weights))
-        reach = jnp.where(reach > 0, reach, 1)
-        points = jnp.where((weights > 0)[:, None], points, here + reach * local_places(points, weights, here, reach))
+        used = (weights > 0)[:, None]
+        if whole is None:
+            here, reach = lax.stop_gradient(frame(points, weights))
+            reach = jnp.where(reach > 0, reach, 1)
+            points = jnp.where(used, points, here + reach * local_places(points, weights, here, reach))
+        else:  # of a block nothing is told of single points, and none may have weight
+            points = jnp.where(used, points, whole[0])
         features, slopes = monomials(points) @ table.T, None
         middle, unit = lax.stop_gradient(frame(features, weights) if whole is None else (whole[2], whole[1]))
         unit = jnp.where(unit > 0, unit, 1)

@@ -114,6 +114,18 @@ def test_nfcv_is_the_same_as_in_memory(embedding, distance, rows):
     same(jf.recover(found, "quadric"), jf.recover(whole, "quadric"), ("coefficients",), 1e-6)
 
 
+@pytest.mark.parametrize(("embedding", "distance"), [("6d", "geometric"), ("4d", "algebraic")])
+def test_a_block_without_weight_counts_for_nothing(embedding, distance):
+    x = np.roll(ball(), N // 3, axis=0)
+    weights = (np.arange(N) >= N // 3).astype(float)
+    options = {"embedding": embedding, "distance": distance, "noise_distance": 0.02}
+    start = jf.nfcv(x, np.ones((N, 1)), weights=THIRD, **options)
+    whole = jf.nfcv(x, start, weights=weights, **options)
+    found = jf.nfcv(jf.blocks(x, rows=N // 3), start, weights=weights, **options)
+    assert int(found.status) == int(whole.status) == 0
+    same(found, whole, ("centers", "normals", "objective", "masses"), 1e-5)
+
+
 def test_linear_varieties_of_lower_dimension():
     x = cloud(5)
     start = jf.nfcv(x, np.ones((N, 1)), embedding="linear", dimension=1, weights=THIRD)

@@ -248,6 +248,9 @@ def test_second_derivatives_are_refused():
     x, seeds = blobs()
     center = lambda m: fcm(x, seeds, m=m).centers[0, 0]
     assert np.isfinite(jax.jit(jax.grad(center))(2.0))
+    # Its own derivative by the direction is none of these.
+    along = lambda d: jax.jvp(center, (2.0,), (d,))[1]
+    np.testing.assert_allclose(jax.grad(along)(1.0), jax.grad(center)(2.0), rtol=1e-12)
     for twice in (jax.grad(jax.grad(center)), jax.jacfwd(jax.grad(center)), jax.hessian(center)):
         with pytest.raises(NotImplementedError, match="second derivatives of a fit are not computed"):
             twice(2.0)
@@ -261,7 +264,7 @@ def test_second_derivatives_are_refused():
         (lambda x, s: fcm(x, s, memberships=1), TypeError, "memberships must be True or False, got 1"),
         (lambda x, s: Solver(mesh=3), TypeError, "mesh must be a Mesh, got int"),
         (lambda x, s: memberships(x, x), TypeError, "partition must be a Partition, got ndarray"),
-        (lambda x, s: fcm([[1, 2], [3]], s), ValueError, "points must be rows of one length"),
+        (lambda x, s: fcm([[1, 2], [3]], s), ValueError, "points must have rows of one length"),
     ],
 )
 def test_arguments_of_another_kind_are_named(call, error, says):

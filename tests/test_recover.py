@@ -100,7 +100,7 @@ def test_known_truth(fits, kind, embedding):
     check(kind, recover(fit, NAMES[kind], points=cloud(kind)), tilted=embedding == "9d")
 
 
-@pytest.mark.parametrize("count", [15, 60])
+@pytest.mark.parametrize("count", [15, 30, 60])
 def test_few_inliers_end_where_they_do_whatever_else_there_is(count):
     """Quantiles of fewer than 25 points lie beyond the last: what follows there, outliers and pads, must not lead them on."""
     rng = np.random.default_rng(0)
@@ -110,15 +110,18 @@ def test_few_inliers_end_where_they_do_whatever_else_there_is(count):
     fit = lambda p, **options: nfcv(p, np.ones((len(p), 1)), embedding="cylinder", noise_distance=0.005, **options)
     alone = recover(fit(own), "cylinder", points=own).height
     assert float(alone) == pytest.approx(0.12, rel=0.1)
-    far = np.r_[own, [[0.2, 5, 1], [0.2, -5, 1]]]
-    pads, weights = np.r_[own, np.full((40, 3), 50.0)], np.r_[np.ones(count), np.zeros(40)]
-    for height in (
-        recover(fit(far), "cylinder").height,
-        recover(fit(far), "cylinder", points=far).height,
-        recover(fit(pads, weights=weights), "cylinder").height,
-        recover(fit(pads, weights=weights), "cylinder", points=pads, weights=weights).height,
+    outliers, pads, ones = np.array([[0.2, 5, 1], [0.2, -5, 1]]), np.full((40, 3), 50.0), np.ones(count)
+    # Whether they come first or last.
+    for far in (np.r_[own, outliers], np.r_[outliers, own]):
+        for height in (recover(fit(far), "cylinder").height, recover(fit(far), "cylinder", points=far).height):
+            np.testing.assert_allclose(height, alone, rtol=1e-5)
+    for padded, weights in (
+        (np.r_[own, pads], np.r_[ones, np.zeros(40)]),
+        (np.r_[pads, own], np.r_[np.zeros(40), ones]),
     ):
-        np.testing.assert_allclose(height, alone, rtol=1e-5)
+        found = fit(padded, weights=weights)
+        for points in ({}, {"points": padded, "weights": weights}):
+            np.testing.assert_allclose(recover(found, "cylinder", **points).height, alone, rtol=1e-5)
 
 
 def test_the_heaviest_variety_is_the_one_with_most_weight():

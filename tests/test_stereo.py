@@ -407,6 +407,8 @@ def test_range_comes_from_the_scene():
         UserWarning, match=r"disparities of 5 to 21 px are searched, but \d+ % of the picture has others, from"
     ):
         search_range(picture.left, picture.right, picture.rig, Matcher(min_disparity=5, disparities=16))
+    with pytest.warns(UserWarning, match="disparities of 30 to"):
+        search_range(picture.left, picture.right, picture.rig, Matcher(min_disparity=30))
     low, count = search_range(picture.left, picture.right, picture.rig, Matcher(min_disparity=5))
     assert low == 5
     assert low + count > np.percentile(seen, 99.7)
@@ -646,6 +648,13 @@ def test_settings_that_cannot_be(settings, error, says):
         Matcher(**settings)
 
 
+@pytest.mark.parametrize(
+    "matcher", [Matcher(method="bm", smoothness=(5, 5000)), Matcher(block=1, smoothness=(5, 5000))]
+)
+def test_prices_of_other_blocks_do_not_reach_the_coarse_look(table, matcher):
+    disparity(table.left, table.right, table.rig, matcher=matcher)
+
+
 def test_disparities_beyond_what_opencv_can_say_are_refused():
     picture = np.random.default_rng(0).integers(0, 255, (48, 4600), np.uint8)
     rig = Rig((4000, 4000), (2300, 24), 0.5, (4600, 48))
@@ -656,10 +665,10 @@ def test_disparities_beyond_what_opencv_can_say_are_refused():
 # Ready disparities
 
 
-def test_multiples_of_pixels_and_millimetres_are_refused():
+def test_multiples_of_pixels_are_told_and_millimetres_refused():
     values = np.full((2, 4), 8.0)
     for name, wrong in (("OpenCV", 16 * values), ("KITTI", (256 * values).astype(np.uint16))):
-        with pytest.raises(ValueError, match=f"disparity_px must be in pixels, got .* in an image 4 wide.*{name}"):
+        with pytest.warns(UserWarning, match=f"disparities are mostly above the 4 px that the image is wide.*{name}"):
             cloud_from_disparity(wrong, None, FLAT)
     with pytest.raises(ValueError, match=r"depth_m must be in metres, got uint16.* multiply by 0\.001"):
         cloud_from_depth((1000 * values).astype(np.uint16), None, FLAT)
