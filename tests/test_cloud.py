@@ -209,6 +209,7 @@ PCD_TEXT = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\
         ("counted.pts", "2\n1 2 3\n4 5 6\n", False),
         ("marked.csv", "\ufeffx,y,z\r\n1,2,3\r\n4,5,6\r\n", False),
         ("cloudcompare.txt", "//X Y Z R G B\n2\n1 2 3 255 0 0\n4 5 6 0 0 255\n", True),
+        ("spaced.txt", "// X Y Z R G B\n1 2 3 255 0 0\n4 5 6 0 0 255\n", True),
         ("capitals.ply", PLY_TEXT.replace("float x", "float X").replace("float z", "float Z"), False),
         ("comments.pcd", "#.PCD v.7\n# by hand\n" + PCD_TEXT.replace("ascii", "ASCII"), False),
     ],
