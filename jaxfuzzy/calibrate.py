@@ -13,6 +13,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.photos import Image, read_grey
 from jaxfuzzy.rig import Calibration, Rig, warn_of_unit
+from jaxfuzzy.rigfiles import side_by_side
 
 FEWEST_PAIRS = 3
 # A pair is left out when its error is so many times the median and more than a pixel, or when the pose of its two
@@ -98,7 +99,7 @@ def calibrate(
             f"no two cameras explain these pairs: the corners are off by {rms:.0f} px; are both lists in the same order, and"
             " is each pair of one moment?"
         )
-    if abs(shift[0]) < max(abs(shift[1]), abs(shift[2])):
+    if not side_by_side(shift):
         raise DataError("one camera seems to stand above or before the other; only side by side is supported")
     if shift[0] > 0:
         raise DataError("left_images seem to be those of the right camera: swap the two lists")

@@ -103,6 +103,16 @@ def noise_distance(value: Any, count: int | None = None, name: str = "noise_dist
     return value
 
 
+def noise_distance_or_auto(value: Any, count: int) -> Any:
+    """A noise distance, for all or for each of so many points; None for "auto", which something else must tell."""
+    if isinstance(value, str):
+        choice(value, "noise_distance", ("auto",))
+        return None
+    if value is None:
+        raise ValueError("noise_distance must be 'auto' or above 0, got None")
+    return noise_distance(value, count)
+
+
 def number(value: Any, name: str, *, above: float | None = None, at_least: float | None = None) -> Any:
     """One finite real number, above or at least a bound."""
     array = real(value, name)
@@ -134,10 +144,10 @@ def choice(value: Any, name: str, allowed: Collection[Any]) -> Any:
     return value
 
 
-def kind(value: Any, name: str, wanted: type) -> Any:
-    """A record of the library's own."""
+def kind(value: Any, name: str, wanted: type, advice: str = "") -> Any:
+    """A record of the library's own; `advice` says where to get one."""
     if not isinstance(value, wanted):
-        raise TypeError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
+        raise TypeError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}{advice and '; ' + advice}")
     return value
 
 

@@ -121,9 +121,10 @@ def write_cloud(
     arrays = {"points": points}
     columns: cloudfiles.Columns = dict(zip("xyz", points.T, strict=True))
     if cloud.colors is not None:
-        if not np.all((np.asarray(cloud.colors) >= -COLOR_SLACK) & (np.asarray(cloud.colors) <= 1 + COLOR_SLACK)):
-            raise ValueError(f"cloud.colors must be 0 to 1, got {np.min(cloud.colors):g} to {np.max(cloud.colors):g}")
-        arrays["colors"] = np.rint(np.clip(np.asarray(cloud.colors), 0, 1) * 255).astype(np.uint8)
+        colors = np.asarray(cloud.colors)
+        if not np.all((colors >= -COLOR_SLACK) & (colors <= 1 + COLOR_SLACK)):
+            raise ValueError(f"cloud.colors must be 0 to 1, got {colors.min():g} to {colors.max():g}")
+        arrays["colors"] = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
         columns |= dict(zip(COLORS[0], arrays["colors"].T, strict=True))
     if cloud.depth_std is not None:
         arrays["depth_std"] = columns["depth_std"] = np.asarray(cloud.depth_std)

@@ -273,12 +273,9 @@ def _deviation(
     eye: np.ndarray | None,
 ) -> tuple[np.ndarray, bool]:
     """Standard deviation of each point, and whether it is known or only up to a factor."""
-    if not isinstance(noise_distance, str):
-        given = checks.noise_distance(noise_distance, len(x))
-        if given is None:
-            raise ValueError("noise_distance must be 'auto' or a number above 0, got None")
+    given = checks.noise_distance_or_auto(noise_distance, len(x))
+    if given is not None:
         return np.broadcast_to(np.asarray(given, x.dtype) / POINT_DELTA, len(x)), True
-    checks.choice(noise_distance, "noise_distance", ("auto",))
     if depth_std is not None:
         given = checks.noise_distance(depth_std, len(x), "depth_std")
         return np.broadcast_to(np.asarray(given, x.dtype), len(x)), True

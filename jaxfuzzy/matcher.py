@@ -80,3 +80,10 @@ class Matcher:
         checks.integer(self.edge_px, "edge_px", at_least=0, at_most=20)
         if self.disparity_std_px is not None:
             checks.number(self.disparity_std_px, "disparity_std_px", above=0.0)
+
+
+def chosen(matcher: Matcher | None) -> Matcher:
+    """The matcher given, or the usual one."""
+    if not isinstance(matcher, Matcher | None):
+        raise TypeError(f"matcher must be a Matcher, got {matcher!r}; Matcher(method=...) says how to match")
+    return Matcher() if matcher is None else matcher

@@ -33,8 +33,7 @@ def read_pair(left: Any, right: Any, rig: Rig) -> tuple[Image, Image]:
         ValueError: An image cannot be used, or sizes disagree.
         TypeError: An argument is neither a path nor an array, or the rig is none.
     """
-    if not isinstance(rig, Rig):
-        raise TypeError(f"rig must be a Rig, got {type(rig).__name__}; load_rig reads one from a file")
+    checks.kind(rig, "rig", Rig, "load_rig reads one from a file")
     images = [_image(value, name) for value, name in ((left, "left"), (right, "right"))]
     if images[0].shape[:2] != images[1].shape[:2]:
         sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]

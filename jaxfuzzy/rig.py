@@ -109,7 +109,7 @@ class Rig:
         _set(self, "rotation", tuple(tuple(row) for row in rotation.tolist()))
         translation = _vector(self.translation, "translation", 3)
         _set(self, "translation", translation)
-        if abs(translation[0]) < max(abs(translation[1]), abs(translation[2])):
+        if not rigfiles.side_by_side(translation):
             raise ValueError(f"translation must be mainly along x (cameras side by side), got {translation}")
         if translation[0] > 0:
             raise ValueError(
@@ -216,7 +216,7 @@ def load_rig(
             given = {"other": other is not None, "cameras": cameras is not None, "rectified": rectified}
             if wrong := [name for name, is_given in given.items() if is_given]:
                 raise ValueError(f"is this library's own JSON, which has no use for {' and '.join(wrong)}")
-            rig = _from_json(text, unit)
+            rig = _in_metres(_from_json(text), 1.0 if unit is None else unit)
         else:
             second = None if other is None else _text(other)
             rig = _from_fields(
@@ -268,13 +268,16 @@ def _from_fields(fields: rigfiles.Fields, unit: float | None, arbitrary_units: b
             f"has the baseline {fields['baseline_m']}, which is not above 0: left and right are swapped, or the"
             " transformation is the inverse"
         )
-    fields["baseline_m"] *= unit
-    if fields.get("translation") is not None:
-        fields["translation"] = tuple(np.asarray(fields["translation"]) * unit)
-    return Rig(**fields, metric=not missing)
+    return _in_metres(Rig(**fields, metric=not missing), unit)
 
 
-def _from_json(text: str, unit: float | None) -> Rig:
+def _in_metres(rig: Rig, unit: float) -> Rig:
+    """A rig whose lengths are in another unit."""
+    moved = None if rig.translation is None else tuple(np.asarray(rig.translation) * unit)
+    return dataclasses.replace(rig, baseline_m=rig.baseline_m * unit, translation=moved)
+
+
+def _from_json(text: str) -> Rig:
     try:
         tree = json.loads(text)
     except json.JSONDecodeError as error:
@@ -294,11 +297,7 @@ def _from_json(text: str, unit: float | None) -> Rig:
     if tree.get("calibration") is not None:
         entries = {name: _tuples(value) for name, value in tree["calibration"].items()}
         tree["calibration"] = Calibration(**entries)
-    rig = Rig(**tree)
-    if unit is None:
-        return rig
-    moved = None if rig.translation is None else tuple(np.asarray(rig.translation) * unit)
-    return dataclasses.replace(rig, baseline_m=rig.baseline_m * unit, translation=moved)
+    return Rig(**tree)
 
 
 def _tuples(value: Any) -> Any:

@@ -7,6 +7,7 @@ does not hold is None or absent, and `rig.load_rig` decides whether that is an e
 import json
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -297,8 +298,13 @@ def _reprojection(q: np.ndarray) -> Fields:
     }
 
 
+def side_by_side(translation: Sequence[float] | np.ndarray) -> bool:
+    """Whether the right camera stands beside the left one rather than above or before it."""
+    return abs(translation[0]) >= max(abs(translation[1]), abs(translation[2]))
+
+
 def _raw(left: Any, left_lens: Any, right: Any, right_lens: Any, rotation: Any, translation: Any) -> Fields:
-    if abs(translation[0]) < max(abs(translation[1]), abs(translation[2])):
+    if not side_by_side(translation):
         raise ValueError(
             "has one camera above or before the other; only side by side is supported: turn the images by 90°"
         )

@@ -18,7 +18,7 @@ from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
-from jaxfuzzy.matcher import Matcher
+from jaxfuzzy.matcher import Matcher, chosen
 from jaxfuzzy.objects import OF_SCENE, PIXELS_PER_POINT
 from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.outline import sight_of, without_seen_through
@@ -143,13 +143,13 @@ def model_scene(
     clock = _Clock(progress)
     with clock.stage("matching"):
         image, image_right = read_pair(left, right, rig)
-        if disparity_px is not None:
-            std = None if matcher is None else checks.kind(matcher, "matcher", Matcher).disparity_std_px
-            cloud = cloud_from_disparity(disparity_px, None, rig, image=image, disparity_std_px=std)
-        else:
-            if not rig.rectified:
-                image, image_right, rig = rectify(image, image_right, rig)
+        if disparity_px is None and not rig.rectified:
+            image, image_right, rig = rectify(image, image_right, rig)
+        if disparity_px is None:
             cloud = reconstruct(image, image_right, rig, matcher=matcher)
+        else:
+            std_px = chosen(matcher).disparity_std_px
+            cloud = cloud_from_disparity(disparity_px, None, rig, image=image, disparity_std_px=std_px)
     scene = _model(cloud, clock, **options)
     return dataclasses.replace(scene, image=_as_rgb(image), image_right=_as_rgb(image_right), rig=rig)
 
@@ -208,20 +208,14 @@ def _model(
     weights: Any = None,
     **options: Any,
 ) -> Scene:
-    if not isinstance(cloud, Cloud):
-        raise TypeError(
-            f"cloud must be a Cloud, got {type(cloud).__name__}; Cloud(points) makes one, read_cloud reads one"
-        )
+    checks.kind(cloud, "cloud", Cloud, "Cloud(points) makes one, read_cloud reads one")
     # Picked from on the host: each number of points picked in JAX would compile and keep a program of its own.
     points = np.asarray(checks.places(cloud.points, "cloud.points"))
     count = points.shape[0]
     vertical = CAMERA_UP if isinstance(up, str) else checks.direction(up, "up")
     known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
-    if isinstance(noise_distance, str):
-        checks.choice(noise_distance, "noise_distance", ("auto",))
-    elif checks.noise_distance(noise_distance, count) is None:
-        raise ValueError("noise_distance must be 'auto' or above 0, got None")
+    checks.noise_distance_or_auto(noise_distance, count)
     if cloud.pixels_px is not None and cloud.pixels_px.shape != (count, 2):
         raise ValueError(f"cloud.pixels_px must have shape ({count}, 2), got {cloud.pixels_px.shape}")
     deviation, plane, status = cloud.depth_std, None, int(cloud.status)
@@ -364,13 +358,13 @@ def _standing(points: np.ndarray, labels: np.ndarray, ground: Plane | None, smal
     nowhere rises above the ground by more than a share of the highest object's height is such a patch, not an object. So is what
     has less than one independent point: a speck left of a wall.
     """
-    groups = range(int(labels.max(initial=-1)) + 1)
-    gone = [k for k in groups if (labels == k).sum() < smallest]
+    groups = [labels == k for k in range(int(labels.max(initial=-1)) + 1)]
+    gone = np.array([own.sum() < smallest for own in groups], bool)
     if ground is not None:
         height = (points - np.asarray(ground.point)) @ np.asarray(ground.normal)
-        rises = [np.quantile(height[labels == k], 0.95) for k in groups]
-        gone += [k for k in groups if rises[k] < FLAT * max(rises)]
-    return ~np.isin(labels, gone)
+        rises = np.array([np.quantile(height[own], 0.95) for own in groups])
+        gone |= rises < FLAT * rises.max(initial=0.0)
+    return ~np.isin(labels, np.flatnonzero(gone))
 
 
 def _of_all(parts: Segmentation, own: np.ndarray, count: int) -> Segmentation:

@@ -287,9 +287,5 @@ def _candidates(ks: Any, rule: str, count: int) -> tuple[int, ...]:
 
 
 def _noise(value: Any, count: int) -> float:
-    if isinstance(value, str):
-        checks.choice(value, "noise_distance", ("auto",))
-        return 0.0
-    if value is None:
-        raise ValueError("noise_distance must be 'auto' or above 0, got None")
-    return float(np.median(np.asarray(checks.noise_distance(value, count))))
+    given = checks.noise_distance_or_auto(value, count)
+    return 0.0 if given is None else float(np.median(np.asarray(given)))

@@ -20,7 +20,7 @@ from jaxfuzzy.arrays import Array, Bool, Float, on_device
 from jaxfuzzy.brightness import UNCHANGED, Line, evened, line_between
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.matcher import FURTHEST_PX, STEP, Matcher
+from jaxfuzzy.matcher import FURTHEST_PX, STEP, Matcher, chosen
 from jaxfuzzy.photos import Alignment, Image, alignment, grey, read_pair, rectify
 from jaxfuzzy.reproject import cloud_from_disparity
 from jaxfuzzy.rig import Rig, load_rig
@@ -55,7 +55,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
         ValueError: An image cannot be used or sizes disagree.
         DataError: Fewer than 50 pixels were matched, or left and right are swapped or one and the same.
     """
-    matcher = _settings(matcher)
+    matcher = chosen(matcher)
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         left, right, rig = rectify(left, right, rig)
@@ -93,18 +93,12 @@ def disparity(
         ValueError: An image cannot be used, sizes disagree, the rig is not rectified or the image is too narrow.
         DataError: Left and right are swapped or one and the same.
     """
-    matcher = _settings(matcher)
+    matcher = chosen(matcher)
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
         raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
     _checked(left, right, matcher)
     return _matched(left, right, rig, matcher)
-
-
-def _settings(matcher: Matcher | None) -> Matcher:
-    if not isinstance(matcher, Matcher | None):
-        raise TypeError(f"matcher must be a Matcher, got {matcher!r}; Matcher(method=...) says how to match")
-    return Matcher() if matcher is None else matcher
 
 
 def _checked(left: Image, right: Image, matcher: Matcher) -> Alignment:
@@ -161,13 +155,6 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
                 f" {block}: give smaller ones or larger images"
             )
 
-    def check_reach(low: int, count: int) -> None:
-        if not -FURTHEST_PX <= low <= low + count <= FURTHEST_PX + STEP:
-            raise ValueError(
-                f"disparities of {low} to {low + count} pixels are beyond the {FURTHEST_PX} that OpenCV's matchers can say:"
-                " shrink the images, and scale the rig with them"
-            )
-
     if count is not None:
         check(count)
     top = width / 2 if rig.max_disparity_px is None else min(rig.max_disparity_px, width)
@@ -193,7 +180,11 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
     low = first if low is None else low
     count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
     check(count)
-    check_reach(low, count)
+    if not -FURTHEST_PX <= low <= low + count <= FURTHEST_PX + STEP:
+        raise ValueError(
+            f"disparities of {low} to {low + count} pixels are beyond the {FURTHEST_PX} that OpenCV's matchers can say:"
+            " shrink the images, and scale the rig with them"
+        )
     return low, count, to_left
 
 

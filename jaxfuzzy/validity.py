@@ -5,7 +5,7 @@ Paper symbols → words: k number of clusters, VRC variance ratio (eq. 6), S_W a
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -226,8 +226,7 @@ def variance_ratio(points: ArrayLike, labels: ArrayLike, *, weights: ArrayLike |
 
 def _within(points: Array, labels: Array, weights: Array | None, clusters: int) -> tuple[Array, Array, Array]:
     """Scatter within and between hard clusters, and the weight they hold."""
-    inside = (labels >= 0).astype(points.dtype)
-    inside = inside if weights is None else inside * weights
+    inside = _counted(labels, weights, points.dtype)
     origin = inside @ points / inside.sum()
     offsets = jnp.where((inside > 0)[:, None], points - origin, 0)
     member = jax.nn.one_hot(labels, clusters, dtype=points.dtype) * inside[:, None]
@@ -276,7 +275,7 @@ def xie_beni(points: ArrayLike, partition: Partition, *, weights: ArrayLike | No
 
 def _xie_beni(points: Array, partition: Partition, weights: Array | None, real: Array) -> Float[Array, ""]:
     compact = jnp.zeros((), points.dtype)
-    heaviness = _counted(partition, weights)
+    heaviness = _counted(partition.labels, weights, points.dtype)
     for i in range(partition.centers.shape[0]):
         apart = jnp.square(points - partition.centers[i]).sum(axis=1)
         compact += (heaviness * partition.memberships[:, i] ** partition.m) @ apart
@@ -307,14 +306,14 @@ def partition_coefficient(
 
 
 def _coefficient(partition: Partition, weights: Array | None, k: int | Array, *, modified: bool) -> Float[Array, ""]:
-    heaviness = _counted(partition, weights)
+    heaviness = _counted(partition.labels, weights, partition.memberships.dtype)
     mean = heaviness @ jnp.square(partition.memberships).sum(axis=1) / heaviness.sum()
     return 1 - k / (k - 1) * (1 - mean) if modified else mean
 
 
-def _counted(partition: Partition, weights: Array | None) -> Float[Array, " N"]:
+def _counted(labels: Array, weights: Array | None, dtype: Any) -> Float[Array, " N"]:
     """Weights of the points that count in an index: those that do not belong to noise most."""
-    inside = (partition.labels >= 0).astype(partition.memberships.dtype)
+    inside = (labels >= 0).astype(dtype)
     return inside if weights is None else inside * weights
 
 
@@ -339,8 +338,7 @@ def fuzzy_silhouette(points: ArrayLike, partition: Partition, *, weights: ArrayL
 
 def _fuzzy_silhouette(points: Array, partition: Partition, weights: Array | None) -> Float[Array, ""]:
     count, clusters = partition.memberships.shape
-    inside = partition.labels >= 0
-    heaviness = inside * (jnp.ones(count, points.dtype) if weights is None else weights)
+    heaviness = _counted(partition.labels, weights, points.dtype)
     member = jax.nn.one_hot(partition.labels, clusters, dtype=points.dtype) * heaviness[:, None]
     mass = member.sum(axis=0)
     rows = min(SILHOUETTE_ROWS, count)

@@ -105,7 +105,7 @@ def pose(
             here, reach = lax.stop_gradient(frame(points, weights))
             reach = jnp.where(reach > 0, reach, 1)
             points = jnp.where(used, points, here + reach * local_places(points, weights, here, reach))
-        else:  # of a block nothing is told of single points, and none may have weight
+        else:  # a block tells nothing of single points, and may have none with weight that could say where they are
             points = jnp.where(used, points, whole[0])
         features, slopes = monomials(points) @ table.T, None
         middle, unit = lax.stop_gradient(frame(features, weights) if whole is None else (whole[2], whole[1]))
