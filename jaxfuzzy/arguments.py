@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -60,6 +61,7 @@ def parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
         description="From a stereo photograph to boxes, cylinders, cones and spheres, by fuzzy clustering.",
         epilog=EXAMPLES,
     )
+    top.add_argument("--version", action="version", version=f"jaxfuzzy {version('jaxfuzzy')}")
     made = top.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
 
     def command(name: str, text: str, end: str, add: Callable[[argparse.ArgumentParser], None]) -> None:

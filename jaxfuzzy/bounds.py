@@ -82,6 +82,8 @@ def ends_of(
         for i in range(3):
             ends[i] = stretch(across[i][on & (part != i)])
             if detail[i] and (on & (part == i)).any():
+                # The other end is no further out, whatever lies beyond the face.
+                ends[i, :2] = (np.minimum if detail[i] > 0 else np.maximum)(ends[i, :2], theta[1 + i])
                 ends[i, 1 if detail[i] > 0 else 0] = theta[1 + i]
     elif kind == "plane":
         first, second = _patch_axes(theta[:3] / np.linalg.norm(theta[:3]), rotation, np)

@@ -28,6 +28,8 @@ LEAST_FACE = 0.035
 SLOPES = (0.06, 2.2)
 # A point is on one face alone where others are so many deviations away.
 CLEAR = 3.0
+# Of the inliers of a box on its other faces, no larger share may lie beyond a face: two walls that part are no corner of a box.
+MOST_BEYOND = 0.25
 
 
 class Mixture(NamedTuple):
@@ -101,7 +103,8 @@ def cone_tapers(theta: Array, own: Array, height: Array) -> Array:
 def faces_hold(theta: Array, signs: Array, part: Array, ownership: Array, background: Array, view: View) -> Array:
     """Every face of a box must hold 3.5 % of its inliers, eight points, and most of the points within its own extent.
 
-    Points that lie on another face as well, near an edge, hold nothing: any plane has such.
+    Points that lie on another face as well, near an edge, hold nothing: any plane has such. And what lies on the other faces must
+    lie behind it.
 
     Args:
         theta: Boxes (H, 5).
@@ -122,9 +125,12 @@ def faces_hold(theta: Array, signs: Array, part: Array, ownership: Array, backgr
         within = within * (jnp.abs(coordinate - mean[..., None]) < 1.7 * spread[..., None])
     filled = (own * within).sum(-1) / (within.sum(-1) + 1e-9) / (1 - background)[:, None]
     inliers = ownership.sum(-1, keepdims=True) + 1e-9
-    near = (jnp.abs(_beyond(theta, view)) * view.gain < CLEAR) & (signs != 0)[..., None]
+    beyond = _beyond(theta, view) * view.gain
+    near = (jnp.abs(beyond) < CLEAR) & (signs != 0)[..., None]
     alone = (own * (near.sum(1, keepdims=True) - near == 0)).sum(-1)
-    held = (alone >= LEAST_FACE * inliers) & (alone >= 8.0) & (filled >= 0.6)
+    others = ownership.sum(-1, keepdims=True) - own.sum(-1)
+    before = ((ownership[:, None] - own) * (signs[..., None] * beyond > CLEAR)).sum(-1)
+    held = (alone >= LEAST_FACE * inliers) & (alone >= 8.0) & (filled >= 0.6) & (before <= MOST_BEYOND * others)
     return (held | (signs == 0)).all(-1)
 
 

@@ -6,6 +6,7 @@ Shared by figures, report, exports and command line, so that an object has one c
 import math
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric, Sphere
@@ -21,6 +22,8 @@ NOISE_COLOR = "#606060"
 SHARP = math.radians(30.0)
 # Of a quadric's mesh along each coordinate: enough for a picture, a fifth of the triangles of its own default.
 CELLS = 24
+# Pixels along the longer side of the picture in which its border is found.
+MOST_PAINTED = 2000
 
 
 class Measure(NamedTuple):
@@ -170,11 +173,14 @@ def outline(body: Primitive | None, rig: Rig) -> np.ndarray:
     """The visible edges of a primitive in the left image, as segments (S, 2, 2) in pixels.
 
     Drawn are edges between a face turned towards the camera and one turned away, free edges, and sharp edges of faces
-    turned towards the camera. Parts behind the camera are left out.
+    turned towards the camera; of a quadric, which may fold many times, the border of all it covers. Parts behind the camera are
+    left out.
     """
     vertices, faces = mesh(body)
     if len(faces) == 0:
         return np.zeros((0, 2, 2))
+    if isinstance(body, Quadric):
+        return _border(project(vertices, rig)[faces])
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     towards = np.sum(normals * corners[:, 0], 1) < 0  # the camera is the origin
@@ -193,6 +199,23 @@ def outline(body: Primitive | None, rig: Rig) -> np.ndarray:
     drawn = sides[first[~shared | silhouette | sharp]]
     segments = project(vertices, rig)[drawn]
     return segments[np.isfinite(segments).all((1, 2))]
+
+
+def _border(triangles: np.ndarray) -> np.ndarray:
+    """The border (S, 2, 2) of what triangles (F, 3, 2) cover together."""
+    triangles = triangles[np.isfinite(triangles).all((1, 2))]
+    if not len(triangles):
+        return np.zeros((0, 2, 2))
+    # Painted small enough that even what comes close to the camera fits.
+    low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    step = max(1.0, float((high - low).max()) / MOST_PAINTED)
+    painted = np.zeros(np.ceil((high - low) / step).astype(int)[::-1] + 3, np.uint8)
+    for corners in np.round((triangles - low) / step).astype(np.int32) + 1:
+        cv2.fillConvexPoly(painted, corners, 1)
+    borders, _ = cv2.findContours(painted, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    smooth = [cv2.approxPolyDP(border, 1.0, True)[:, 0] for border in borders]
+    segments = [np.stack([border, np.roll(border, -1, axis=0)], 1) for border in smooth]
+    return low + (np.concatenate(segments) - 1) * step
 
 
 def silhouette(body: Primitive | None, rig: Rig) -> np.ndarray:

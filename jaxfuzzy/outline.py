@@ -1,7 +1,8 @@
 """Whether a shape would hide what is seen: a body hides what stands behind it, so through one that is there nothing is seen.
 
 A surface may hold an object's points and still be none: twigs lie near one plane, the front of a head on a blunt cone. Such a
-surface goes on where the object does not, and there the camera looks through it at what stands behind. Every point of the cloud
+surface goes on where the object does not, and there the camera looks through it at what stands behind. And nothing is seen from
+within a body: the corner of a room is no cone. Every point of the cloud
 whose viewing ray passes the surface within its ends has a say; what was not matched has none, and what stands before it neither.
 """
 
@@ -16,6 +17,7 @@ from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Shape, refused
 from jaxfuzzy.status import Status
+from jaxfuzzy.trials import inside
 
 # A surface is refused when so large a share of the points that pass it lies behind. Right ones: at most 0.02 on rendered tables,
 # 0.12 on depth-camera tables, 0.11 on photographs (an oval hat box as a cylinder), 0.21 on simulated tables of which 40 % are
@@ -88,12 +90,14 @@ def without_seen_through(
         sight: What the camera sees.
         wholes: Indices of all points of each object, where the shapes are those of a share of them.
     """
-    return tuple(
-        refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
-        if seen_through(points, own, shape, sight, whole).share > THROUGH
-        else shape
-        for own, shape, whole in zip(members, shapes, wholes or members, strict=True)
-    )
+    told = []
+    for own, shape, whole in zip(members, shapes, wholes or members, strict=True):
+        if inside(shape.primitive, sight.camera[None], 0.0).any():
+            shape = refused(shape, Status.SEEN_THROUGH, "the camera would stand within it")
+        elif seen_through(points, own, shape, sight, whole).share > THROUGH:
+            shape = refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
+        told.append(shape)
+    return tuple(told)
 
 
 class Through(NamedTuple):

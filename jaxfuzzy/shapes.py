@@ -32,9 +32,9 @@ NARROW = 10.0
 FAMILIES = {"plane": "flat", "box": "flat", "cylinder": "turned", "cone": "turned", "sphere": "sphere"}
 GUARDS = {
     "plane": "not tried",
-    "box": "a face holds too few of the points within its extent",
-    "cylinder": "its radius is next to nothing, or so large that it is flat",
-    "cone": "it does not taper by a quarter, or its radius is out of range",
+    "box": "a face holds too few of the points within its extent, or other faces lie beyond it",
+    "cylinder": "its radius is next to nothing, or so large that it is flat, or less than 75 degrees around it are seen",
+    "cone": "it does not taper by a quarter, or its radius is out of range, or less than 75 degrees around it are seen",
     "sphere": "its radius is next to nothing, or so large that it is flat",
 }
 

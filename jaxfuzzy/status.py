@@ -85,8 +85,8 @@ SENTENCES: dict[Status, str] = {
     " bound the value, or use another loss.",
     Status.SCATTERED: "Points scatter more than twice as much as noise_distance says, even within small windows: raise it if it is"
     " too small.",
-    Status.SEEN_THROUGH: "The best surface would hide things that are seen behind it: the object has another outline, or holes, or"
-    " is several; see the guards for the kind.",
+    Status.SEEN_THROUGH: "The best surface would hide things that are seen behind it, or the camera itself: the object has another"
+    " outline, or holes, or is several; see the guards for the kind.",
     Status.PIECE: "A piece of something larger: much of its border in the picture is no step in depth, so its surface goes on; see"
     " the guards for the kind.",
 }

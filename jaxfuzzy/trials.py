@@ -37,17 +37,17 @@ def contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequenc
         if a in into or held_by(shapes[a]) < SURFACE * len(members[a]):
             continue
         slack = SLACK * float(shapes[a].noise_distance)
-        inside = [len(own) > 0 and _inside(shapes[a].primitive, own, slack).mean() >= INSIDE for own in some]
+        within = [len(own) > 0 and inside(shapes[a].primitive, own, slack).mean() >= INSIDE for own in some]
         for b in range(len(members)):
             small = len(members[b]) <= MOST_INSIDE * len(members[a])
             # A group that holds others is no part itself.
-            if small and inside[a] and inside[b] and b != a and b not in into and b not in into.values():
+            if small and within[a] and within[b] and b != a and b not in into and b not in into.values():
                 into[b] = a
     return into
 
 
-def _inside(body: Primitive | None, points: np.ndarray, slack: float) -> np.ndarray:
-    """Which points lie inside a round body, or outside by no more than the slack."""
+def inside(body: Primitive | None, points: np.ndarray, slack: float) -> np.ndarray:
+    """Which points (N, 3) lie inside a round body, or outside by no more than the slack."""
     if isinstance(body, Sphere):
         return np.asarray(lengths(points - np.asarray(body.center)) <= float(body.radius) + slack)
     if isinstance(body, Cylinder):

@@ -19,10 +19,21 @@ ORDER = """
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate brightness stereo render
     outline pieces occlusion evidence rivals vertical scene losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal
-    cli __init__
+    cli __main__ __init__
 """.split()
 DOORS = {
-    "cv2": {"rig", "rigfiles", "stereo", "photos", "calibrate", "matcher", "render", "reproject", "brightness"},
+    "cv2": {
+        "rig",
+        "rigfiles",
+        "stereo",
+        "photos",
+        "calibrate",
+        "matcher",
+        "render",
+        "reproject",
+        "brightness",
+        "drawing",
+    },
     "optimistix": {"solve", "refine", "primitives", "tuning"},
     "sklearn": {"estimators"},
     "matplotlib": {"plot", "report", "page"},

@@ -72,6 +72,15 @@ def test_help_teaches(run, words):
     assert max(map(len, out.splitlines())) <= 120
 
 
+def test_the_module_is_the_command_line():
+    words = [sys.executable, "-m", "jaxfuzzy"]
+    done = subprocess.run([*words, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"jaxfuzzy {jaxfuzzy.__version__}\n"
+    failed = subprocess.run([*words, "model"], capture_output=True, text=True, check=False)
+    assert failed.returncode == 2
+    assert "Traceback" not in failed.stderr
+
+
 def test_help_comes_without_drawing_or_modelling():
     code = "import sys, jaxfuzzy.arguments as a\na.parser(dict.fromkeys(%r))\n" % (COMMANDS,)  # noqa: UP031
     code += "print([m for m in ('matplotlib', 'k3d', 'tqdm') if m in sys.modules])"

@@ -154,3 +154,24 @@ def test_an_open_vessel_is_seen_into():
     lid = lambda p: p[:, 1] > -0.2501
     before, after = told(vessel, missing=lid)
     assert after is before
+
+
+def test_nothing_is_seen_from_within_a_body():
+    """The corner of a room lies on a cone that holds the camera; one that ends before the camera may hold it."""
+    for name, changes in (
+        ("cylinder", {"radius": jnp.asarray(2.0)}),
+        ("cone", {"apex": jnp.array([0, 3.0, 1.3]), "half_angle": jnp.asarray(0.6), "height": jnp.array([0.1, 5.0])}),
+        ("sphere", {"radius": jnp.asarray(1.5)}),
+    ):
+        before, _ = told(BODIES[name])
+        around = dataclasses.replace(before, primitive=dataclasses.replace(before.primitive, **changes))
+        points = np.random.default_rng(0).uniform([-0.1, -0.1, 1.2], [0.1, 0.1, 2.0], (len(before.inliers), 3))
+        sight = sight_of(points, np.zeros(len(points), bool), CAMERA, UP)
+        after = without_seen_through(points, [np.arange(len(points))], [around], sight)[0]
+        assert after.kind == "unknown"
+        assert int(after.status) == Status.REFUSED | Status.SEEN_THROUGH
+        assert "camera" in after.guards[-1]
+    low = dataclasses.replace(BODIES["cylinder"], radius=jnp.asarray(2.0), base=jnp.array([0, -0.5, 1.3]))
+    before = dataclasses.replace(before, kind="cylinder", primitive=low)
+    after = without_seen_through(points, [np.arange(len(points))], [before], sight)[0]
+    assert "camera" not in "".join(after.guards)

@@ -544,3 +544,74 @@ def test_a_look_knows_whose_candidates_the_scores_are_that_it_was_told():
     assert known.rivals[0] is first
     assert known.rivals[1].fitted.polished is second.fitted.polished
     assert sorted(known.rivals) == [0, 1]
+
+
+def pieces_of(*patches, seed=0, std=0.002):
+    """Flat patches, each a corner and two edges, with noise along the viewing rays."""
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([corner + rng.uniform(size=(n, 2)) @ edges for corner, edges, n in patches])
+    away = np.linalg.norm(points, axis=1, keepdims=True)
+    return points * (1 + std * rng.normal(size=away.shape) / away)
+
+
+def test_walls_that_part_are_no_corner_of_a_box():
+    """A side of a street and the front of a house beyond it: each lies outside what the other could be a face of.
+
+    They were a box whose third edge was -0.56 m long.
+    """
+    # In the frame of the walls: one at x = 0.45, one at z = -0.28, the camera between them.
+    eye = np.array([1.36, 0.75, 0.08])
+    side = np.array([0.45, -0.07, 0.29]), np.array([[0, 0.6, 0], [0, 0, 0.42]]), 600
+    front = np.array([-1.1, -0.9, -0.28]), np.array([[1.5, 0, 0], [0, 1.0, 0]]), 600
+    walls = [(corner - eye, edges, n) for corner, edges, n in (side, front)]
+    shape = fit_shape(pieces_of(*walls), noise_distance=0.005, camera=CAMERA)
+    assert shape.kind != "box"
+    assert any(guard.startswith("box: ") for guard in shape.guards)
+    # The same two as walls of one house are a box.
+    side = np.array([0.45, -0.07, -0.7]), side[1], 600
+    house = [(corner - eye, edges, n) for corner, edges, n in (side, front)]
+    shape = fit_shape(pieces_of(*house), noise_distance=0.005, camera=CAMERA)
+    assert shape.kind == "box"
+    assert (np.asarray(shape.primitive.size) > 0).all()
+
+
+def test_an_edge_is_never_longer_than_nothing_when_others_lie_beyond_its_face():
+    """By hand: a face at x = 1 that looks along x, and points of other faces between 1.5 and 2."""
+    theta, detail = np.array([0.0, 1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    hits = np.array([[1.0, 0, 0], *[[x, 0, 0] for x in np.linspace(1.5, 2, 9)]])
+    ends = bounds.ends_of("box", theta, hits, np.array([0] + [1] * 9), np.ones(10, bool), detail, np.eye(3))
+    assert ends[0, 0] == ends[0, 1] == 1.0
+
+
+def side_of_a_cylinder(degrees, radius=0.3, height=0.5, std=0.002, count=1500):
+    """As much of an upright cylinder before the camera, symmetric to it."""
+    rng = np.random.default_rng(1)
+    angle = np.deg2rad(rng.uniform(-degrees / 2, degrees / 2, count))
+    points = np.stack(
+        [radius * np.sin(angle), rng.uniform(-height, height, count) / 2, -radius * np.cos(angle)], axis=1
+    )
+    points = points + [0.1, 0.0, 1.5]
+    return points * (1 + std * rng.normal(size=(count, 1)) / np.linalg.norm(points, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_a_cylinder_of_which_little_is_seen_is_none(camera):
+    narrow, wide = (fit_shape(side_of_a_cylinder(degrees), noise_distance=0.005, camera=camera) for degrees in (60, 90))
+    assert wide.kind == "cylinder"
+    assert float(wide.primitive.radius) == pytest.approx(0.3, rel=0.02)  # four standard deviations of this arc
+    assert narrow.kind != "cylinder"
+    assert any("75 degrees" in guard and guard.startswith("cylinder") for guard in narrow.guards)
+
+
+def test_an_arc_is_cut_nowhere():
+    """Wherever around the axis it lies, seen from there it has the same number of degrees."""
+    cloud = side_of_a_cylinder(150, std=0.0)
+    for turn in (0.0, 1.0, 2.5, 3.1):
+        c, s = np.cos(turn), np.sin(turn)
+        points = cloud @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+        item = SimpleNamespace(points=points, rays=np.zeros_like(points), weight=np.ones(len(points)))
+        axis = (np.array([0.1, 0.0, 1.5]) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]))[[0, 2]]
+        zero = np.zeros(len(points))
+        found = SimpleNamespace(square=zero, scale=1.0, part=zero, depth=zero, turn=np.eye(3), theta=axis)
+        # 96 % of what is spread evenly lies between the two quantiles.
+        assert looks._arc(item, found) == pytest.approx(0.96 * 150, rel=0.01)
