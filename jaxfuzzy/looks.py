@@ -154,36 +154,32 @@ def unfit(item: Prepared | None) -> Status:
     return Status(0)
 
 
-def first_looks(items: Sequence[Prepared], settings: Settings) -> list[Look]:
-    """Searches all objects, again where the noise was not what was thought."""
-    looks = _search(items, settings)
-    first = list(looks)
-    unsure = [i for i, item in enumerate(items) if not item.given]
+def first_look(item: Prepared, settings: Settings) -> Look:
+    """Searches an object, again where the noise was not what was thought."""
+    look = _search(item, settings)
+    expected = look.expected
     # A wrong first guess of the noise blurs the search or blinds it: look again with what was found.
     for _ in range(MOST_LOOKS - 1):
-        unsure = [i for i in unsure if not OVERRATED <= looks[i].fitted.polished.scale <= UNDERRATED]
-        sharper = _search([_with_noise_found(looks[i]) for i in unsure], settings, [first[i].expected for i in unsure])
-        better = []
-        for i, new in zip(unsure, sharper, strict=True):
-            if looks[i].fitted.polished.scale < OVERRATED or new.score < looks[i].score:
-                looks[i] = new
-                better.append(i)
-        unsure = better
-    return looks
+        scale = look.fitted.polished.scale
+        if item.given or OVERRATED <= scale <= UNDERRATED:
+            break
+        sharper = _search(_with_noise_found(look), settings, expected)
+        if scale >= OVERRATED and sharper.score >= look.score:
+            break
+        look = sharper
+    return look
 
 
-def further_looks(looks: Sequence[Look], settings: Settings) -> list[Look]:
+def further_look(look: Look, settings: Settings) -> Look:
     """Searches what a box or a cone fits badly once more, as it may be lying."""
-    looks = list(looks)
-    doubtful = [(i, o) for i, o in enumerate(looks) if o.reason or o.misfit > SUSPECT]
-    turned = [(i, look, item) for i, look in doubtful for item in _turned(look, settings)]
-    others = _search([item for *_, item in turned], settings, [look.expected for _, look, _ in turned])
-    for (i, look, _), new in zip(turned, others, strict=True):
+    best = look
+    for item in _turned(look, settings) if look.reason or look.misfit > SUSPECT else ():
+        new = _search(item, settings, look.expected)
         # Another vertical is one more freedom: what it finds must fit well.
-        if not new.reason and new.misfit <= SUSPECT and (looks[i].reason or new.score < looks[i].score):
-            whole = _judged(_knowing(new, looks[i])._replace(item=_whole(new.item, look, settings)), settings)
-            looks[i] = looks[i] if whole.reason else whole
-    return looks
+        if not new.reason and new.misfit <= SUSPECT and (best.reason or new.score < best.score):
+            whole = _judged(_knowing(new, best)._replace(item=_whole(new.item, look, settings)), settings)
+            best = best if whole.reason else whole
+    return best
 
 
 def look_as(look: Look, kind: str, settings: Settings) -> Look:
@@ -245,26 +241,20 @@ def side_by_side(work: Callable[[T], R], items: Iterable[T]) -> list[R]:
     return list(threads(AT_A_TIME).map(work, items))
 
 
-def _search(items: Sequence[Prepared], settings: Settings, expected: Sequence[float] = ()) -> list[Look]:
-    if not items:
-        return []
+def _search(item: Prepared, settings: Settings, expected: float = 0.0) -> Look:
+    """The best surface of one object; `expected` is the noise of its points in its unit, 0 where this look is to say."""
+    small = padded(item, settings.capacity, settings.dtype)
     allowed = np.array([k in settings.kinds for k in KINDS])
-
-    def search(i: int) -> Look:
-        item = items[i]
-        small = padded(item, settings.capacity, settings.dtype)
-        fitted = fitting.fit(small, allowed, settings.gric, settings.along_ray)
-        noise = expected[i] if expected else max(1.0, fitted.local) * fitted.deviation * item.typical
-        # What the last polish took out of shape is of another kind.
-        while _worn(item, fitted):
-            passed = fitted.passed & (np.arange(len(KINDS)) != fitted.kind)
-            kind = fitting.best_kind(fitted.scores, passed)
-            fitted = fitted._replace(kind=kind, passed=passed)
-            if passed.any():
-                fitted = fitted._replace(polished=fitting.finished(small, fitted.found, kind, settings.along_ray))
-        return _judged(Look(item, fitted, noise, Status(0)), settings)
-
-    return side_by_side(search, range(len(items)))
+    fitted = fitting.fit(small, allowed, settings.gric, settings.along_ray)
+    noise = expected or max(1.0, fitted.local) * fitted.deviation * item.typical
+    # What the last polish took out of shape is of another kind.
+    while _worn(item, fitted):
+        passed = fitted.passed & (np.arange(len(KINDS)) != fitted.kind)
+        kind = fitting.best_kind(fitted.scores, passed)
+        fitted = fitted._replace(kind=kind, passed=passed)
+        if passed.any():
+            fitted = fitted._replace(polished=fitting.finished(small, fitted.found, kind, settings.along_ray))
+    return _judged(Look(item, fitted, noise, Status(0)), settings)
 
 
 def _worn(item: Prepared, fitted: Fitted) -> bool:
@@ -279,7 +269,8 @@ def _worn(item: Prepared, fitted: Fitted) -> bool:
 
 def _arc(item: Prepared, polished: Polished) -> float:
     """How many degrees around the axis of a body of revolution its points lie."""
-    n = min(len(item.points), len(polished.square))
+    # The first points are a fair sample of all.
+    n = min(len(item.points), MORE)
     on = (np.sqrt(polished.square[:n]) <= DEVIATIONS * max(1.0, float(polished.scale))) & (item.weight[:n] > 0)
     # Lid and floor are seen from above all around.
     on &= polished.part[:n] != 1

@@ -19,6 +19,7 @@ ALIGNMENT_WIDTH, FEATURES, FEWEST_FEATURES = 800, 500, 20
 LEAST_SHARE = 0.2  # of matched features that must agree: real pairs 0.24 to 0.95, repeating patterns at wrong rows 0.15
 # How rows differ over the picture is told from so many features and such a share on: fewer, of a chart, lay on a wrong plane.
 SURE_FEATURES, SURE_SHARE = 100, 0.4
+SURELY = 3.0  # standard errors: features of one thing err together
 BRIGHTEST = 0.999  # this quantile of more than 8 bits becomes white: a few hot pixels would make all others dark
 
 
@@ -213,7 +214,7 @@ def alignment(left: Image, right: Image) -> Alignment:
     return Alignment(
         matches=int(good.sum()),
         rows_px=float(plane[0]),
-        corners_px=float(np.maximum(np.abs(plane) - 2 * error, 0)[1:].sum()),
+        corners_px=float(np.maximum(np.abs(plane) - SURELY * error, 0)[1:].sum()),
         disparity_px=(float(low), float(middle), float(high)),
         swapped=bool(np.mean(across[good] < -1) > 0.9),
     )

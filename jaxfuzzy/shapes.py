@@ -16,7 +16,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, on_device, record, static
 from jaxfuzzy.assembly import Bounded, bounded
 from jaxfuzzy.fitting import TOLERANCES, Fitted
-from jaxfuzzy.looks import Look, Settings, first_looks, further_looks, look_about, look_as, side_by_side, unfit
+from jaxfuzzy.looks import Look, Settings, first_look, further_look, look_about, look_as, side_by_side, unfit
 from jaxfuzzy.mostpoints import most_points
 from jaxfuzzy.objects import DEVIATIONS, MOST, Prepared, capacity_for, prepared
 from jaxfuzzy.primitives import Primitive
@@ -269,21 +269,27 @@ class Fits:
     ) -> tuple[dict[int, Look], list[Status]]:
         """Looks at sets that have one, and why the others have none."""
         keys = [hashlib.blake2b(m.tobytes(), digest_size=16).digest() for m in members]
-        items = {key: self._prepared(m) for key, m in zip(keys, members, strict=True) if key not in self._first}
-        poor = {key: unfit(item) for key, item in items.items()}
-        good = {key: item for key, item in items.items() if item is not None and not poor[key]}
-        if good and not self.settings.capacity:
-            most = max(len(item.points) for item in good.values())
-            self.settings = self.settings._replace(capacity=capacity_for(min(most, MOST)))
-        found = first_looks(list(good.values()), self.settings)
-        self._first |= poor | dict(zip(good, found, strict=True))
-        known = {key: look for key in keys if isinstance(look := self._first[key], Look)}
         wanted = {key for i, key in enumerate(keys) if further is None or further[i]}
-        ahead = {key: look for key, look in known.items() if key in wanted and key not in self._further}
-        self._further |= dict(zip(ahead, further_looks(list(ahead.values()), self.settings), strict=True))
-        known |= {key: self._further[key] for key in known if key in self._further}
-        why = [Status(0) if isinstance(look := self._first[key], Look) else look for key in keys]
-        return {i: known[key] for i, key in enumerate(keys) if key in known}, why
+        if not self.settings.capacity and members:
+            self.settings = self.settings._replace(capacity=capacity_for(min(max(map(len, members)), MOST)))
+
+        def looked(key: bytes) -> tuple[Look | Status, Look | None]:
+            first, more = self._first.get(key), self._further.get(key)
+            if first is None:
+                item = self._prepared(sets[key])
+                first = unfit(item) or first_look(item, self.settings)  # type: ignore[arg-type]
+            if isinstance(first, Look) and key in wanted and more is None:
+                more = further_look(first, self.settings)
+            return first, more
+
+        sets = dict(zip(keys, members, strict=True))
+        for key, (first, more) in zip(sets, side_by_side(looked, sets), strict=True):
+            self._first[key] = first
+            if more is not None:
+                self._further[key] = more
+        found = [self._further.get(key, self._first[key]) for key in keys]
+        looks = {i: look for i, look in enumerate(found) if isinstance(look, Look)}
+        return looks, [Status(0) if isinstance(why, Look) else why for why in found]
 
     def _prepared(self, own: np.ndarray) -> Prepared | None:
         if not len(own):

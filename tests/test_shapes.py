@@ -613,5 +613,5 @@ def test_an_arc_is_cut_nowhere():
         axis = (np.array([0.1, 0.0, 1.5]) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]))[[0, 2]]
         zero = np.zeros(len(points))
         found = SimpleNamespace(square=zero, scale=1.0, part=zero, depth=zero, turn=np.eye(3), theta=axis)
-        # 96 % of what is spread evenly lies between the two quantiles.
-        assert looks._arc(item, found) == pytest.approx(0.96 * 150, rel=0.01)
+        # 96 % of what is spread evenly lies between the two quantiles; of 512 points each errs by 0.6 % of it.
+        assert looks._arc(item, found) == pytest.approx(0.96 * 150, rel=0.02)
