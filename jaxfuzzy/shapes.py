@@ -33,8 +33,8 @@ FAMILIES = {"plane": "flat", "box": "flat", "cylinder": "turned", "cone": "turne
 GUARDS = {
     "plane": "not tried",
     "box": "a face holds too few of the points within its extent, or other faces lie beyond it",
-    "cylinder": "its radius is next to nothing, or so large that it is flat, or less than 75 degrees around it are seen",
-    "cone": "it does not taper by a quarter, or its radius is out of range, or less than 75 degrees around it are seen",
+    "cylinder": "its radius is next to nothing, or so large that it is flat, or less than 60 degrees around it are seen",
+    "cone": "it does not taper by a quarter, or its radius is out of range, or less than 60 degrees around it are seen",
     "sphere": "its radius is next to nothing, or so large that it is flat",
 }
 
