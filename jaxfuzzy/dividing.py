@@ -10,9 +10,9 @@ from jaxfuzzy import checks
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.looks import ROUND, side_by_side
-from jaxfuzzy.shapes import Shape, refused
+from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
-from jaxfuzzy.trials import Fit, contained, held_by, lies, named_sets, some_of
+from jaxfuzzy.trials import Fit, contained, held_by, lies, named_sets, refused, some_of
 
 # Labels by places of the points with these indices.
 Parted = Callable[[np.ndarray], np.ndarray]

@@ -14,8 +14,9 @@ from jaxfuzzy.arrays import on_device
 from jaxfuzzy.choice import PLANE_BONUS
 from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.search import KINDS, MORE
-from jaxfuzzy.shapes import FAMILIES, Shape, refused
+from jaxfuzzy.shapes import FAMILIES, Shape
 from jaxfuzzy.status import Status
+from jaxfuzzy.trials import refused
 
 # Pixels of as many independent points as the largest number of parameters of a kind.
 FEWEST_PIXELS = 6 * PIXELS_PER_POINT

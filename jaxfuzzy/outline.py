@@ -15,9 +15,9 @@ from jaxfuzzy.arrays import lengths
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive, Quadric
 from jaxfuzzy.render import body_of
-from jaxfuzzy.shapes import Shape, refused
+from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
-from jaxfuzzy.trials import inside
+from jaxfuzzy.trials import inside, refused
 
 # A surface is refused when so large a share of the points that pass it lies behind. Right ones: at most 0.02 on rendered tables,
 # 0.12 on depth-camera tables, 0.11 on photographs (an oval hat box as a cylinder), 0.21 on simulated tables of which 40 % are

@@ -13,8 +13,9 @@ import numpy as np
 
 from jaxfuzzy.arrays import extents
 from jaxfuzzy.primitives import Plane, Quadric
-from jaxfuzzy.shapes import Shape, refused
+from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
+from jaxfuzzy.trials import refused
 
 # Neighbors are so many pixels away.
 STEP = 5

@@ -14,6 +14,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, lengths, on_device, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
+from jaxfuzzy.flecks import in_flecks
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes, members_of
 from jaxfuzzy.linalg import tangents
@@ -235,6 +236,8 @@ def _model(
                 thickness, flat = float(standing.cut), np.asarray(standing.ground)
                 plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
                 vertical = vertical if plane is None else np.asarray(plane.normal)
+                if smallest > 1:
+                    kept &= ~in_flecks(np.asarray(cloud.pixels_px), kept, smallest)
         if isinstance(noise_distance, str) and deviation is not None:
             noise_distance = NOISE_SIGMAS * np.asarray(deviation)
         segment_rule, shape_rule = RULES[rule]

@@ -325,19 +325,6 @@ def with_quadrics(
     return tuple(told)
 
 
-def refused(shape: Shape, status: Status, why: str) -> Shape:
-    """The same object as "unknown", though a surface holds its points."""
-    return dataclasses.replace(
-        shape,
-        kind="unknown",
-        primitive=None,
-        inliers=jax.device_put(np.zeros(len(shape.inliers), bool)),
-        covariance=on_device(np.zeros((0, 0)), shape.covariance.dtype),
-        status=on_device(Status.REFUSED | status, np.int32),
-        guards=(*shape.guards, f"{shape.kind}: {why}"),
-    )
-
-
 def _by_most_points(
     points: np.ndarray,
     weight: np.ndarray,

@@ -1,13 +1,16 @@
 """What joining and dividing groups have in common: what is tried, what lies inside what, and what cannot be."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+import jax
 import numpy as np
 
-from jaxfuzzy.arrays import lengths
+from jaxfuzzy.arrays import lengths, on_device
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.shapes import Shape
+from jaxfuzzy.status import Status
 
 K = TypeVar("K")
 # Fits shapes to sets of points given by their indices; of shares of larger sets it is told these too, and which sets may be lying.
@@ -62,6 +65,19 @@ def inside(body: Primitive | None, points: np.ndarray, slack: float) -> np.ndarr
     across = lengths(offset - along[:, None] * axis)
     within = (along >= low - slack) & (along <= high + slack)
     return np.asarray(within & (across <= radius + slope * along + slack))
+
+
+def refused(shape: Shape, status: Status, why: str) -> Shape:
+    """The same object as "unknown", though a surface holds its points."""
+    return dataclasses.replace(
+        shape,
+        kind="unknown",
+        primitive=None,
+        inliers=jax.device_put(np.zeros(len(shape.inliers), bool)),
+        covariance=on_device(np.zeros((0, 0)), shape.covariance.dtype),
+        status=on_device(Status.REFUSED | status, np.int32),
+        guards=(*shape.guards, f"{shape.kind}: {why}"),
+    )
 
 
 def held_by(shape: Shape) -> float:

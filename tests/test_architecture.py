@@ -17,7 +17,8 @@ ORDER = """
     quadrics
     shapes trials joining dividing groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate brightness stereo render
-    outline pieces occlusion evidence rivals vertical scene losses tuning sensitivity drawing plot export folder page report table
+    flecks outline pieces occlusion evidence rivals vertical scene
+    losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal
     cli __main__ __init__
 """.split()
@@ -33,6 +34,7 @@ DOORS = {
         "reproject",
         "brightness",
         "drawing",
+        "flecks",
     },
     "optimistix": {"solve", "refine", "primitives", "tuning"},
     "sklearn": {"estimators"},

@@ -7,7 +7,7 @@ from jaxfuzzy import scene as module
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.fcm import fcm
-from jaxfuzzy.render import paper_scene, render_pair
+from jaxfuzzy.render import paper_scene, render_pair, table_scene
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.scene import load_scene, model_cloud, model_scene
 from jaxfuzzy.seeding import histogram_seeds
@@ -156,6 +156,14 @@ def test_specks_of_table_and_wall_are_no_objects(tilt, seed):
     picture = render_pair(paper_scene(np.deg2rad(tilt)), seed=seed)
     scene = model_scene(picture.left, picture.right, picture.rig)
     assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
+
+
+@pytest.mark.parametrize(("seed", "tilt"), [(100, 0.42), (102, 0.58)])
+def test_flecks_of_a_noisy_table_are_no_object(seed, tilt):
+    """Noise of six grey levels lifts a thousand pixels of the table by more than the noise of the rest, in flecks of ten."""
+    picture = render_pair(table_scene(seed, tilt=tilt), seed=seed, noise=6.0)
+    scene = model_scene(picture.left, picture.right, picture.rig)
+    assert sorted(shape.kind for shape in scene.shapes) == ["box", "cone", "cylinder", "sphere"]
 
 
 def test_disparities_of_another_matcher_take_the_place_of_matching(paper_pair):

@@ -12,6 +12,8 @@ import pytest
 
 from jaxfuzzy import bounds, fitting, looks, polish, rays, starts
 from jaxfuzzy.objects import MOST, Frame, fair_order
+from jaxfuzzy.primitives import Cylinder
+from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Fits, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
 from jaxfuzzy.status import Status
@@ -510,23 +512,58 @@ def test_what_the_last_polish_took_out_of_shape_is_none(first, polished, kind, m
     assert kind == first or any(guard.startswith(f"{first}: it") for guard in shape.guards)
 
 
-def test_an_axis_is_square_to_most_normals_though_a_third_are_of_edges():
+def noisy_directions(directions, rng, std=0.02):
+    directions = directions + rng.normal(0, std, directions.shape)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def degrees_between(one, other):
+    return np.degrees(np.arccos(min(1.0, abs(one @ other))))
+
+
+@pytest.mark.parametrize("ends", [0, 10, 24])
+def test_the_axis_of_most_normals_is_found_though_others_are_of_edges_and_of_an_end(ends):
     rng = np.random.default_rng(0)
     truth = np.array([0.6, 0.0, 0.8])
     around = np.linspace(-1.2, 1.2, 16)
     side = np.cos(around)[:, None] * np.cross(truth, [0, 1, 0]) + np.sin(around)[:, None] * np.array([0, 1.0, 0])
-    side += rng.normal(0, 0.02, side.shape)
     # Edges of a hand's breadth look one way; unusable normals are zero.
-    edges = np.array([0.5, 0.1, 0.86]) + rng.normal(0, 0.1, (8, 3))
-    normals = np.concatenate([side, edges, np.zeros((4, 3))])
-    normals[:24] /= np.linalg.norm(normals[:24], axis=1, keepdims=True)
-    axis = looks._square_to_most(normals)
+    edges = noisy_directions(np.tile([0.5, 0.1, 0.86], (8, 1)), rng, 0.1)
+    end = noisy_directions(np.tile(truth, (ends, 1)), rng)
+    normals = np.concatenate([noisy_directions(side, rng), edges, end, np.zeros((4, 3))])
+    axis = looks._axis_of_most(normals)
     plain = np.linalg.eigh(normals.T @ normals)[1][:, 0]
-    # 16 normals wrong by 0.02 each leave less than that; of all of them it would be far off.
-    assert np.degrees(np.arccos(abs(axis @ truth))) < 1.5 < 20 < np.degrees(np.arccos(abs(plain @ truth)))
-    # Without two that differ any direction square to the one will do.
-    alone = looks._square_to_most(np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
+    # 16 normals wrong by 0.02 each leave less than that; by all of them alike it would be far off.
+    assert degrees_between(axis, truth) < 1.5 < 20 < degrees_between(plain, truth)
+
+
+def test_without_two_normals_that_differ_any_direction_square_to_the_one_will_do():
+    alone = looks._axis_of_most(np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
     assert abs(alone[1]) < 1e-12
+
+
+@pytest.mark.parametrize("told", [1, 5])
+@pytest.mark.parametrize("yaw", [0, 25, 40, 50, 60])
+def test_a_lying_cylinder_is_named_whatever_it_turns_to_the_camera(yaw, told):
+    """From 40 degrees on the end is seen beside the side, as of a can; with more noise told than there is a box fits."""
+    turn, tilt = np.deg2rad(yaw), np.deg2rad(35)
+    up = np.array([0.0, -np.cos(tilt), -np.sin(tilt)])
+    away = np.cross([1.0, 0.0, 0.0], up)
+    axis = np.cos(turn) * np.array([1.0, 0.0, 0.0]) + np.sin(turn) * away
+    middle = np.array([0.05, 0.1, 1.0])
+    truth = Cylinder(middle - 0.06 * axis, axis, np.array(0.03), np.array(0.12))
+    x, y = np.meshgrid(np.linspace(-0.15, 0.25, 120), np.linspace(-0.1, 0.3, 120))
+    rays_ = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    rays_ /= np.linalg.norm(rays_, axis=1, keepdims=True)
+    depth = body_of(truth).hit(rays_)[0]
+    met = np.isfinite(depth)
+    for seed in range(4):
+        noise = 0.001 * np.random.default_rng(seed).normal(size=(met.sum(), 1))
+        points = rays_[met] * (depth[met][:, None] + noise)
+        shape = fit_shape(points, noise_distance=SIGMAS * 0.001 * told, camera=CAMERA, up=up)
+        assert shape.kind == "cylinder"
+        assert degrees_between(np.asarray(shape.primitive.axis), axis) < 1.0
+        assert float(shape.primitive.radius) == pytest.approx(0.03, rel=0.02)
 
 
 def test_a_look_knows_whose_candidates_the_scores_are_that_it_was_told():

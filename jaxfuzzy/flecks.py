@@ -1,0 +1,37 @@
+"""Flecks: connected pieces of the picture that are too small to say anything, such as what matching errors lift above a table.
+
+Neighboring pixels err alike, so that a piece of fewer pixels than tell as much as one independent point may be no more than one
+error. Pixels belong to one piece where less than a few steps lie between them, as pixels that were not matched do.
+"""
+
+import cv2
+import numpy as np
+
+from jaxfuzzy.arrays import extents
+
+# Gaps of so many times the usual spacing of pixels do not part a piece.
+GAP = 2.0
+# Points that are fewer than one in so many pixels of their picture are in no pieces.
+SPARSE = 100
+
+
+def in_flecks(pixels: np.ndarray, kept: np.ndarray, fewest: int) -> np.ndarray:
+    """Which of some points are in pieces of less than so many.
+
+    Args:
+        pixels: Column and row of each point of the cloud (N, 2).
+        kept: Which points are asked about (N,).
+        fewest: Pieces of fewer points are flecks.
+    """
+    extent = extents(pixels) + 1
+    if not kept.any() or not extent.prod() <= SPARSE * len(pixels):
+        return np.zeros(len(pixels), bool)
+    column, row = np.round(pixels - pixels.min(axis=0)).astype(int).T
+    mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
+    mask[row[kept], column[kept]] = 1
+    reach = int(np.ceil(GAP * np.sqrt(extent.prod() / len(pixels)))) | 1
+    grown = cv2.dilate(mask, np.ones((reach, reach), np.uint8))
+    count, piece = cv2.connectedComponents(grown, connectivity=8)
+    own = piece[row, column]
+    size = np.bincount(own[kept], minlength=count)
+    return kept & (size[own] < fewest)
