@@ -22,6 +22,8 @@ from jaxfuzzy.trials import refused
 FEWEST_PIXELS = 6 * PIXELS_PER_POINT
 # In nats of independent points: below, another family is as likely, and the next kind is nearly as good.
 TELLS, NARROW = 1.0, 3.0
+# Whether what is round narrows: below, it is as likely a cone as a cylinder.
+TELLS_OF_ROUND = 0.25
 # Of its points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
 HOLDS = 0.3
 
@@ -79,7 +81,8 @@ def _told_apart(shape: Shape) -> Shape:
         return refused(shape, Status.TOO_FEW_POINTS, "too few pixels for the errors that they share")
     if np.asarray(shape.inliers).mean() < HOLDS:
         return refused(shape, Status(0), "it holds too few of the object's points")
-    return refused(shape, Status.LOW_MARGIN, "another kind is as likely") if _lead(shape) < TELLS else shape
+    tied = shape.kind in ("cylinder", "cone") and shape.margin < TELLS_OF_ROUND
+    return refused(shape, Status.LOW_MARGIN, "another kind is as likely") if tied or _lead(shape) < TELLS else shape
 
 
 def _lead(shape: Shape) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.choice import PLANE_BONUS
-from jaxfuzzy.evidence import FEWEST_PIXELS, HOLDS, NARROW, TELLS, in_independent_points, told_apart
+from jaxfuzzy.evidence import FEWEST_PIXELS, HOLDS, NARROW, TELLS, TELLS_OF_ROUND, in_independent_points, told_apart
 from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.primitives import Cylinder, Plane
 from jaxfuzzy.shapes import GUARDS
@@ -66,6 +66,14 @@ def test_another_family_that_is_as_likely_refuses():
     assert shape.guards == (*guards, "cylinder: another kind is as likely")
     # A kind that a guard spoke against is no rival, nor is a cone one of a cylinder.
     assert told(scores | {"sphere": 2 * TELLS, "cone": TELLS / 2}, guards=guards).kind == "cylinder"
+
+
+def test_what_is_as_likely_a_cone_as_a_cylinder_is_neither():
+    shape = told({"cylinder": 0.0, "cone": TELLS_OF_ROUND / 2, "sphere": 12.0})
+    assert shape.kind == "unknown"
+    assert shape.guards == ("cylinder: another kind is as likely",)
+    # A plane may well be a face of a box.
+    assert told({"plane": 0.0, "box": TELLS_OF_ROUND / 2, "sphere": 12.0}, body=FLAT).kind == "plane"
 
 
 def test_the_bonus_of_planes_is_no_evidence():
