@@ -31,6 +31,9 @@ MISFIT, SUSPECT, NEAR, BULGE = 1.9, 1.35, 0.06, 0.055
 # And over that of small windows from which on it may be lying, though the noise that was given hides it. On rendered tables right
 # surfaces have up to 1.45, boxes fitted to lying cylinders 2.5 and more.
 UNEVEN = 1.8
+# And where it leaves so large a share of the points to the background, and so many of the normals of small pieces, which outliers
+# have none of, are more than so many radians from any of its own. A group of pixels holds pieces of other things as well.
+MUCH_LEFT, ODD, SAME = 0.1, 0.1, 0.35
 # The same where the noise was given: real tins, cups and boxes stay below 1.7, a carved mask has 1.86.
 MISFIT_GIVEN = 1.75
 # A surface is refused too where its noise is so many times what was given, or more, and so many times what small windows say: the
@@ -176,7 +179,7 @@ def first_look(item: Prepared, settings: Settings) -> Look:
 def further_look(look: Look, settings: Settings) -> Look:
     """Searches what a box or a cone fits badly once more, as it may be lying."""
     best = look
-    for item in _turned(look, settings) if _doubtful(look) else ():
+    for item in _turned(look, settings) if _doubtful(look, settings.correlated) else ():
         new = _search(item, settings, look.expected)
         # Another vertical is one more freedom: what it finds must fit well.
         if not new.reason and new.misfit <= SUSPECT and (best.reason or new.score < best.score):
@@ -185,11 +188,34 @@ def further_look(look: Look, settings: Settings) -> Look:
     return best
 
 
-def _doubtful(look: Look) -> bool:
-    """Whether another vertical may fit better: the surface is refused, or its noise is not that of the points."""
-    # A flat thing may be bent a little.
-    uneven = KINDS[look.fitted.kind] != "plane" and look.fitted.polished.scale > UNEVEN * look.fitted.local
-    return bool(look.reason or look.misfit > SUSPECT or uneven)
+def _doubtful(look: Look, correlated: bool) -> bool:
+    """Whether another vertical may fit better: the surface is refused, leaves much over, or its noise is not that of the points."""
+    polished = look.fitted.polished
+    # A flat thing may be bent a little, and a ball has no axis.
+    turns = KINDS[look.fitted.kind] not in ("plane", "sphere")
+    uneven = turns and polished.scale > UNEVEN * look.fitted.local
+    left = not correlated and polished.background > MUCH_LEFT and _odd_normals(look) > ODD
+    return bool(look.reason or look.misfit > SUSPECT or uneven or left)
+
+
+def _odd_normals(look: Look) -> float:
+    """The share of the normals of small pieces of surface that none of the surface found has."""
+    theta, kind = look.fitted.polished.theta, KINDS[look.fitted.kind]
+    normals = np.asarray(look.fitted.found.normals)
+    normals = normals[normals.any(axis=1)] @ look.fitted.polished.turn.T
+    if not len(normals) or kind == "sphere":
+        return 0.0
+    if kind == "plane":
+        has = np.abs(normals @ theta[:3]) / np.linalg.norm(theta[:3])
+    elif kind == "box":
+        c, s = np.cos(theta[0]), np.sin(theta[0])
+        has = np.abs(normals @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])).max(axis=1)
+    else:
+        # Of a side, or of a lid.
+        lean = np.arctan(theta[3])
+        has = np.maximum(np.cos(np.arcsin(np.clip(normals[:, 1], -1, 1)) - lean), np.abs(normals[:, 1]))
+        has = np.maximum(has, np.cos(np.arcsin(np.clip(-normals[:, 1], -1, 1)) - lean))
+    return float((has < np.cos(SAME)).mean())
 
 
 def look_as(look: Look, kind: str, settings: Settings) -> Look:

@@ -12,7 +12,7 @@ import pytest
 
 from jaxfuzzy import bounds, fitting, looks, polish, rays, starts
 from jaxfuzzy.objects import MOST, Frame, fair_order
-from jaxfuzzy.primitives import Cylinder
+from jaxfuzzy.primitives import Box, Cylinder
 from jaxfuzzy.render import body_of
 from jaxfuzzy.shapes import Fits, fit_shape, fit_shapes
 from jaxfuzzy.simulate import KINDS, simulate_object
@@ -552,18 +552,53 @@ def test_a_lying_cylinder_is_named_whatever_it_turns_to_the_camera(yaw, told):
     axis = np.cos(turn) * np.array([1.0, 0.0, 0.0]) + np.sin(turn) * away
     middle = np.array([0.05, 0.1, 1.0])
     truth = Cylinder(middle - 0.06 * axis, axis, np.array(0.03), np.array(0.12))
-    x, y = np.meshgrid(np.linspace(-0.15, 0.25, 120), np.linspace(-0.1, 0.3, 120))
-    rays_ = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
-    rays_ /= np.linalg.norm(rays_, axis=1, keepdims=True)
-    depth = body_of(truth).hit(rays_)[0]
-    met = np.isfinite(depth)
     for seed in range(4):
-        noise = 0.001 * np.random.default_rng(seed).normal(size=(met.sum(), 1))
-        points = rays_[met] * (depth[met][:, None] + noise)
+        points = seen_by_rays(truth, np.random.default_rng(seed))
         shape = fit_shape(points, noise_distance=SIGMAS * 0.001 * told, camera=CAMERA, up=up)
         assert shape.kind == "cylinder"
         assert degrees_between(np.asarray(shape.primitive.axis), axis) < 1.0
         assert float(shape.primitive.radius) == pytest.approx(0.03, rel=0.02)
+
+
+def turned_any_way(rng):
+    """A rotation drawn evenly."""
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return rotation * np.sign(np.linalg.det(rotation))
+
+
+def seen_by_rays(body, rng, std=0.001):
+    """Points of a body before a camera that looks ahead."""
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 160), np.linspace(-0.3, 0.3, 160))
+    ray = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    depth = body_of(body).hit(ray)[0]
+    met = np.isfinite(depth)
+    return ray[met] * (depth[met] + std * rng.normal(size=met.sum()))[:, None]
+
+
+def test_a_box_on_its_edge_is_named_though_one_face_holds_most_of_it():
+    """A plane holds 0.6 of it and fits well; the rest is no outliers, since small pieces of it have normals of their own."""
+    for seed in (0, 8, 25, 28):
+        rng = np.random.default_rng([seed, 5])
+        axes, size = turned_any_way(rng), rng.uniform(0.04, 0.07)
+        edges = 2 * size * np.array([1, rng.uniform(0.7, 1.4), rng.uniform(0.5, 1.0)])
+        body = Box(np.array([0.0, 0.0, 1.0]), edges, axes, np.ones(3, bool))
+        up = np.array([0.0, -0.82, -0.57])
+        shape = fit_shape(seen_by_rays(body, rng), noise_distance=0.0025, camera=CAMERA, up=up)
+        assert shape.kind == "box"
+        assert np.abs(np.asarray(shape.primitive.axes) @ axes.T).max(axis=1).min() > np.cos(np.deg2rad(1.0))
+
+
+def test_what_outliers_leave_over_is_not_looked_at_again(monkeypatch):
+    """They have no normals, or any; a second search would cost as much as the first."""
+    searches = []
+    search = looks._search
+    monkeypatch.setattr(looks, "_search", lambda *a: searches.append(1) or search(*a))
+    for kind in ("plane", "cylinder", "cone", "sphere"):
+        cloud = simulate_object(kind, 7, outliers=0.5)
+        shape = fit_shape(cloud.points, camera=cloud.camera, noise_distance=SIGMAS * cloud.depth_std)
+        assert shape.kind == kind
+    assert len(searches) == 4
 
 
 def test_a_look_knows_whose_candidates_the_scores_are_that_it_was_told():
