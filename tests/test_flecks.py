@@ -42,6 +42,13 @@ def test_pixels_that_were_not_matched_part_no_piece():
     assert in_flecks(pixels[~gone], kept[~gone], 250)[(block & kept)[~gone]].all()
 
 
+def test_pieces_that_meet_at_a_corner_are_one():
+    rows, columns = (a.ravel() for a in np.indices((60, 80)))
+    pixels = np.stack([columns, rows], axis=1).astype(float)
+    kept = (rows // 10 == columns // 10) & (rows < 40)
+    assert not in_flecks(pixels, kept, 101).any()
+
+
 def test_what_is_no_picture_has_no_flecks():
     scattered = np.random.default_rng(0).uniform(0, 1000, (500, 2))
     assert not in_flecks(scattered, np.ones(500, bool), 100).any()
