@@ -70,7 +70,7 @@ ROUND = ("cylinder", "cone", "sphere")
 # Of a cylinder or cone so many degrees around its axis are to be seen, between these quantiles of its points: a wide one holds two
 # flat things at an angle, or one that is bent. Of half hidden cylinders on rendered tables 63 and more are seen, on photographs 90,
 # and pieces of planes in rooms and streets lay on 19 to 55.
-LEAST_ARC, ARC_ENDS = 60.0, (0.02, 0.98)
+LEAST_ARC, ARC_ENDS = 60.0, np.array([0.02, 0.98])
 # Second principal spread over first below which points are one line; third over first, one plane to the last digit.
 LINE, SHEET = 1e-4, 1e-7
 # One more than there are processors, as Python prepares the next.
@@ -307,16 +307,19 @@ def _arc(item: Prepared, polished: Polished) -> float:
     """How many degrees around the axis of a body of revolution its points lie."""
     # The first points are a fair sample of all.
     n = min(len(item.points), MORE)
-    on = (np.sqrt(polished.square[:n]) <= DEVIATIONS * max(1.0, float(polished.scale))) & (item.weight[:n] > 0)
+    reach = DEVIATIONS * max(1.0, float(polished.scale))
     # Lid and floor are seen from above all around.
-    on &= polished.part[:n] != 1
+    on = (polished.square[:n] <= reach**2) & (item.weight[:n] > 0) & (polished.part[:n] != 1)
     if on.sum() < FEWEST:
         return 360.0
-    hits = item.points[:n][on] + polished.depth[:n][on, None] * item.rays[:n][on]
-    across = (hits @ polished.turn[[0, 2]].T - polished.theta[:2]) @ np.array([1, 1j])
+    hits = item.points[:n] + polished.depth[:n, None] * item.rays[:n]
+    x, z = (hits @ polished.turn[[0, 2]].T - polished.theta[:2])[on].T
+    length = np.maximum(np.hypot(x, z), 1e-12)
     # Angles from the middle of them, so that none is cut in two.
-    angle = np.degrees(np.angle(across * np.conj((across / np.maximum(np.abs(across), 1e-12)).sum())))
-    return float(np.diff(np.quantile(angle, ARC_ENDS))[0])
+    c, s = (x / length).sum(), (z / length).sum()
+    angle = np.sort(np.arctan2(c * z - s * x, c * x + s * z))
+    low, high = (ARC_ENDS * (len(angle) - 1)).round().astype(int)
+    return float(np.degrees(angle[high] - angle[low]))
 
 
 def _reason(look: Look, correlated: bool) -> Status:
