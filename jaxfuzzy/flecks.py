@@ -1,8 +1,7 @@
 """Flecks: connected pieces of the picture that are too small to say anything, such as what matching errors lift above a table.
 
 Neighboring pixels err alike, so that a piece of fewer pixels than tell as much as one independent point may be no more than one
-error. Pixels belong to one piece where few steps lie between them, as between those around one that was
-not matched.
+error. Pixels belong to one piece where few steps lie between them, as between those around one that was not matched.
 """
 
 import cv2
