@@ -11,7 +11,7 @@ from jaxfuzzy.arrays import extents
 
 # Gaps of so many times the usual spacing of pixels do not part a piece.
 GAP = 1.5
-# Points that are fewer than one in so many pixels of their picture are in no pieces.
+# Points that are fewer than one in so many pixels of their picture are in no pieces, and have no neighbors.
 SPARSE = 100
 
 
@@ -23,11 +23,11 @@ def in_flecks(pixels: np.ndarray, kept: np.ndarray, fewest: int) -> np.ndarray:
         kept: Which points are asked about (N,).
         fewest: Pieces of fewer points are flecks.
     """
-    extent = extents(pixels) + 1
-    if not kept.any() or not extent.prod() <= SPARSE * len(pixels):
+    each = pixels_a_point(pixels)
+    if not kept.any() or not each <= SPARSE:
         return np.zeros(len(pixels), bool)
     # In cells of so many pixels, with those around: that is quicker than to grow every pixel.
-    cell = np.ceil(GAP * np.sqrt(extent.prod() / len(pixels)))
+    cell = np.ceil(GAP * np.sqrt(each))
     column, row = ((pixels - pixels.min(axis=0)) / cell).astype(int).T
     mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
     mask[row[kept], column[kept]] = 1
@@ -35,3 +35,8 @@ def in_flecks(pixels: np.ndarray, kept: np.ndarray, fewest: int) -> np.ndarray:
     own = piece[row, column]
     size = np.bincount(own[kept], minlength=count)
     return kept & (size[own] < fewest)
+
+
+def pixels_a_point(pixels: np.ndarray) -> float:
+    """How many pixels of the picture that points (N, 2) span there are to each of them; infinite where there is none."""
+    return float((extents(pixels) + 1).prod() / len(pixels)) if len(pixels) else np.inf

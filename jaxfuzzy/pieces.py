@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxfuzzy.arrays import extents
+from jaxfuzzy.flecks import SPARSE, pixels_a_point
 from jaxfuzzy.primitives import Plane, Quadric
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -19,8 +19,6 @@ from jaxfuzzy.trials import refused
 
 # Neighbors are so many pixels away.
 STEP = 5
-# Points that are fewer than one in so many pixels of their picture have no neighbors to ask.
-SPARSE = 100
 # A group is a piece where so large a share of these neighbors goes on. On photographs and rendered tables objects have at most
 # 0.01, a beam along a wall and things wrapped in cloth 0.11, bent pieces of a wall 0.41 and 0.49.
 GOES_ON = 0.25
@@ -46,8 +44,7 @@ def without_pieces(
         members: Indices of the points of each shape.
         shapes: The shapes.
     """
-    extent = extents(pixels) + 1
-    if not extent.prod() <= SPARSE * len(pixels):
+    if not pixels_a_point(pixels) <= SPARSE:
         return tuple(shapes)
     column, row = np.round(pixels - pixels.min(axis=0)).astype(int).T + STEP
     point = np.full((row.max() + STEP + 1, column.max() + STEP + 1), -1)
