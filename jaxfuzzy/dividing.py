@@ -16,6 +16,8 @@ from jaxfuzzy.trials import Fit, contained, held_by, lies, named_sets, refused, 
 
 # Labels by places of the points with these indices.
 Parted = Callable[[np.ndarray], np.ndarray]
+# Pieces, as indices, of the points with these indices, between which the depth steps by more than so much a pixel.
+Stepped = Callable[[np.ndarray, float], list[np.ndarray]]
 
 # A group of which one surface holds this share is one object. Two surfaces must hold this share of the others, and this much
 # more than one does; a part that a surface leaves over is an object where its own holds the second share.

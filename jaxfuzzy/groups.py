@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy.arrays import on_device
-from jaxfuzzy.dividing import Parted, cut_in_two, left_over, with_left_over
+from jaxfuzzy.dividing import SMALLEST, Parted, Stepped, cut_in_two, left_over, with_left_over
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.joining import parts_of_one_body
 from jaxfuzzy.segment import Segmentation
@@ -70,6 +70,44 @@ def by_shapes(
             groups.append((own, shape, k) if pair is None else (*joined[pair], k))
     into = {b: a for a, b in joined}
     return _rebuilt(points, parts, groups, into), tuple(shape for _, shape, _ in groups)
+
+
+def by_steps(
+    points: np.ndarray,
+    parts: Segmentation,
+    shapes: tuple[Shape, ...],
+    fit: Fit,
+    stepped: Stepped,
+    least: int,
+) -> tuple[Segmentation, tuple[Shape, ...]]:
+    """Divides groups that no surface holds where the depth steps: pieces that have a surface of their own are objects.
+
+    Args:
+        points: Points (N, 3).
+        parts: Their division.
+        shapes: The shape of each group.
+        fit: Fits shapes to sets of points given by their indices.
+        stepped: The pieces of points given by their indices between which the depth steps by more than a noise distance.
+        least: Points below which no part of a group is an object.
+
+    Returns:
+        The division and the shapes that came of it; the same records where nothing changed.
+    """
+    members = members_of(parts)
+    pieces = {
+        k: [piece for piece in stepped(own, float(shape.noise_distance)) if len(piece) <= (1 - SMALLEST) * len(own)]
+        for k, (own, shape) in enumerate(zip(members, shapes, strict=True))
+        if shape.primitive is None and len(own) >= 2 * least
+    }
+    divided = with_left_over(points, members, shapes, pieces, fit, least)
+    if not divided:
+        return parts, shapes
+    groups: list[tuple[np.ndarray, Shape, int]] = []
+    for k, both in enumerate(zip(members, shapes, strict=True)):
+        # A rest that is too small to be an object is none.
+        of = [(own, shape) for own, shape in divided.get(k, [both]) if k not in divided or len(own) >= least]
+        groups += [(own, shape, k) for own, shape in of]
+    return _rebuilt(points, parts, groups, {}), tuple(shape for _, shape, _ in groups)
 
 
 def members_of(parts: Segmentation) -> list[np.ndarray]:

@@ -16,7 +16,7 @@ from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
 from jaxfuzzy.flecks import in_flecks
 from jaxfuzzy.ground import fit_ground, foreground
-from jaxfuzzy.groups import by_shapes, members_of
+from jaxfuzzy.groups import by_shapes, by_steps, members_of
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher, chosen
@@ -31,6 +31,7 @@ from jaxfuzzy.rig import Rig
 from jaxfuzzy.rivals import chosen_by_outline
 from jaxfuzzy.segment import Segmentation, segment
 from jaxfuzzy.shapes import Fits, Shape, with_quadrics
+from jaxfuzzy.steps import between_steps
 from jaxfuzzy.stereo import reconstruct
 from jaxfuzzy.trials import FEWEST
 from jaxfuzzy.vertical import agreed_vertical, upright_again, witness_of
@@ -290,6 +291,11 @@ def _model(
         def parted(of: np.ndarray) -> np.ndarray:
             return np.asarray(segment(places[of], **seen(own[of])).labels)
 
+        def stepped(of: np.ndarray, noise: float) -> list[np.ndarray]:
+            return [
+                of[i] for i in between_steps(np.asarray(cloud.pixels_px)[own[of]], lengths(places[of] - eye), noise)
+            ]
+
         def as_kinds(of: Sequence[int], kinds: Sequence[str]) -> tuple[Shape, ...]:
             return in_independent_points(fits.shapes_as([members[i] for i in of], kinds), OF_SCENE)
 
@@ -305,6 +311,8 @@ def _model(
         if segment_rule == "robust" and "ks" not in options:
             across = np.asarray(tangents(vertical))
             parts, shapes = by_shapes(places, across, parts, shapes, fit, parted, eye, least)
+            if correlated and eye is not None:
+                parts, shapes = by_steps(places, parts, shapes, fit, stepped, least)
             members = members_of(parts)
         if correlated:
             shapes = in_independent_points(shapes, OF_SCENE)

@@ -74,16 +74,19 @@ def photographed(folder, left, right):
     return scene, at
 
 
-def test_a_lying_crayon_behind_a_brush_is_one_cylinder(shared_data):
+def test_a_lying_crayon_behind_a_brush_is_one_cylinder_and_a_cup_before_a_ring_an_object(shared_data):
     scene, at = photographed(shared_data / "middlebury2005_art", "view1.png", "view5.png")
     left, right = at(109, 313), at(237, 315)
     assert left is right
-    assert [shape.kind for shape in scene.shapes].count("cylinder") == 1
     assert left.kind == "cylinder"
     # It lies, as long as six of its radii.
     body = left.primitive
     assert abs(np.asarray(body.axis) @ np.asarray(scene.up)) < 0.1
     assert 5 < float(body.height / body.radius) < 7
+    # The cup narrows a little; places gather it with the ring that stands behind it.
+    cup = at(385, 310)
+    assert cup.kind in ("cylinder", "cone")
+    assert cup is not at(440, 170)
 
 
 def test_of_the_paper_cones_nothing_is_named_wrongly(shared_data):
