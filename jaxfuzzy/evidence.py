@@ -16,7 +16,7 @@ from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.search import KINDS, MORE
 from jaxfuzzy.shapes import FAMILIES, Shape
 from jaxfuzzy.status import Status
-from jaxfuzzy.trials import refused
+from jaxfuzzy.trials import lies, refused
 
 # Pixels of as many independent points as the largest number of parameters of a kind.
 FEWEST_PIXELS = 6 * PIXELS_PER_POINT
@@ -24,6 +24,8 @@ FEWEST_PIXELS = 6 * PIXELS_PER_POINT
 TELLS, NARROW = 1.0, 3.0
 # Whether what is round narrows: below, it is as likely a cone as a cylinder.
 TELLS_OF_ROUND = 0.25
+# A body whose axis has a smaller cosine with the vertical was found about another one, and that took two parameters more.
+TURNED = 0.8
 # Of its points a surface holds this share at least: on photographs right ones hold 0.53 and more, a cone within a plant 0.2.
 HOLDS = 0.3
 
@@ -38,9 +40,14 @@ def in_independent_points(shapes: Sequence[Shape], fitted_to: int) -> tuple[Shap
     return tuple(_in_independent_points(shape, fitted_to) for shape in shapes)
 
 
-def told_apart(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
-    """Shapes whose scores and margins are those of independent points, "unknown" where these do not tell."""
-    return tuple(_told_apart(shape) for shape in shapes)
+def told_apart(shapes: Sequence[Shape], up: np.ndarray) -> tuple[Shape, ...]:
+    """Shapes whose scores and margins are those of independent points, "unknown" where these do not tell.
+
+    Args:
+        shapes: The shapes.
+        up: The vertical.
+    """
+    return tuple(_told_apart(shape, up) for shape in shapes)
 
 
 def worth(count: int, used: int) -> float:
@@ -71,7 +78,7 @@ def _in_independent_points(shape: Shape, fitted_to: int) -> Shape:
     )
 
 
-def _told_apart(shape: Shape) -> Shape:
+def _told_apart(shape: Shape, up: np.ndarray) -> Shape:
     if shape.kind not in KINDS:
         return shape
     count = len(shape.inliers)
@@ -82,11 +89,19 @@ def _told_apart(shape: Shape) -> Shape:
     if np.asarray(shape.inliers).mean() < HOLDS:
         return refused(shape, Status(0), "it holds too few of the object's points")
     tied = shape.kind in ("cylinder", "cone") and shape.margin < TELLS_OF_ROUND
-    return refused(shape, Status.LOW_MARGIN, "another kind is as likely") if tied or _lead(shape) < TELLS else shape
+    # The direction of its axis is two parameters more, by which also a box must lead a plane, which has none.
+    turned = lies(shape.primitive, up, TURNED)
+    least = TELLS + (np.log(count / PIXELS_PER_POINT) if turned else 0.0)
+    tied |= _lead(shape, turned) < least
+    return refused(shape, Status.LOW_MARGIN, "another kind is as likely") if tied else shape
 
 
-def _lead(shape: Shape) -> float:
-    """Nats by which a kind leads the best one of another family that no guard spoke against, without the bonus of planes."""
+def _lead(shape: Shape, turned: bool) -> float:
+    """Nats by which a kind leads the best one of another family that no guard spoke against, without the bonus of planes.
+
+    A turned box is of another family than a plane.
+    """
     bonus = PLANE_BONUS / worth(len(shape.inliers), MORE)
-    others = {k: s + bonus * (k == "plane") for k, s in shape.scores.items()}
-    return margin_of(shape, {k: s for k, s in others.items() if k == shape.kind or FAMILIES[k] != FAMILIES[shape.kind]})
+    scores = {k: s + bonus * (k == "plane") for k, s in shape.scores.items()}
+    other = lambda k: FAMILIES[k] != FAMILIES[shape.kind] or (turned and k == "plane")
+    return margin_of(shape, {k: s for k, s in scores.items() if k == shape.kind or other(k)})

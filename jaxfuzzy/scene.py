@@ -336,7 +336,7 @@ def _model(
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
         if correlated:
-            shapes = told_apart(shapes)
+            shapes = told_apart(shapes, np.asarray(vertical, float))
     settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
     return Scene(
         cloud=cloud,

@@ -85,11 +85,11 @@ def held_by(shape: Shape) -> float:
     return float(np.asarray(shape.inliers).sum())
 
 
-def lies(body: Primitive | None, up: np.ndarray) -> bool:
-    """Whether no axis of a body is upright."""
+def lies(body: Primitive | None, up: np.ndarray, upright: float = UPRIGHT) -> bool:
+    """Whether no axis of a body is upright, which is to have so large a cosine with the vertical."""
     if isinstance(body, Box):
-        return bool(np.abs(np.asarray(body.axes) @ up).max() < UPRIGHT)
-    return isinstance(body, Cylinder | Cone) and abs(float(np.asarray(body.axis) @ up)) < UPRIGHT
+        return bool(np.abs(np.asarray(body.axes) @ up).max() < upright)
+    return isinstance(body, Cylinder | Cone) and abs(float(np.asarray(body.axis) @ up)) < upright
 
 
 def some_of(own: np.ndarray, count: int = TRIED) -> np.ndarray:

@@ -9,12 +9,13 @@ import pytest
 from jaxfuzzy.choice import PLANE_BONUS
 from jaxfuzzy.evidence import FEWEST_PIXELS, HOLDS, NARROW, TELLS, TELLS_OF_ROUND, in_independent_points, told_apart
 from jaxfuzzy.objects import PIXELS_PER_POINT
-from jaxfuzzy.primitives import Cylinder, Plane
+from jaxfuzzy.primitives import Box, Cylinder, Plane
 from jaxfuzzy.shapes import GUARDS
 from jaxfuzzy.status import Status
 from synthetic import fitted_shape
 
 BODY = Cylinder(jnp.zeros(3), jnp.array([0, 1.0, 0]), jnp.asarray(0.1), jnp.asarray(0.3))
+UP = np.array([0.0, 1.0, 0.0])
 FLAT = Plane(jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros((4, 3)))
 FITTED_TO, SCORED = 2048, 512
 PIXELS = 10 * FITTED_TO
@@ -33,7 +34,7 @@ def told(scores, body=BODY, pixels=PIXELS, guards=()):
         covariance=jnp.eye(2),
         guards=guards,
     )
-    return told_apart(in_independent_points([shape], FITTED_TO))[0]
+    return told_apart(in_independent_points([shape], FITTED_TO), UP)[0]
 
 
 def test_scores_margin_and_covariance_are_those_of_independent_points():
@@ -96,12 +97,34 @@ def test_a_surface_that_holds_few_of_its_points_is_refused():
     for share, kind in ((HOLDS - 0.01, "unknown"), (HOLDS + 0.01, "cylinder")):
         shape = fitted_shape(BODY, np.arange(PIXELS) < share * PIXELS, 0.01)
         shape = dataclasses.replace(shape, scores={"plane": 1e3, "cylinder": 0.0}, margin=1e3)
-        assert told_apart([shape])[0].kind == kind
+        assert told_apart([shape], UP)[0].kind == kind
 
 
 def test_what_has_no_name_keeps_none():
     shape = fitted_shape(None, np.zeros(50, bool), 0.01)
-    same = told_apart(in_independent_points([shape], FITTED_TO))[0]
+    same = told_apart(in_independent_points([shape], FITTED_TO), UP)[0]
     assert same.kind == "unknown"
     assert int(same.status) == 0
     assert same.guards == ()
+
+
+@pytest.mark.parametrize(("lean", "allowed"), [(0.0, 0.0), (0.6, 0.0), (0.7, 1.0), (np.pi / 2, 1.0)])
+def test_a_body_about_another_vertical_must_lead_by_the_price_of_its_axis(lean, allowed):
+    body = dataclasses.replace(BODY, axis=jnp.array([np.sin(lean), np.cos(lean), 0.0]))
+    # Two parameters, at half the logarithm of the number of independent points each.
+    least = TELLS + allowed * np.log(PIXELS / PIXELS_PER_POINT)
+    assert told({"cylinder": 0.0, "sphere": least + 0.1}, body=body).kind == "cylinder"
+    assert told({"cylinder": 0.0, "sphere": least - 0.1}, body=body).kind == "unknown"
+    # A cone would have the same axis.
+    assert told({"cylinder": 0.0, "cone": 0.5, "sphere": least + 0.1}, body=body).kind == "cylinder"
+
+
+def test_a_turned_box_must_lead_a_plane_too():
+    axes = jnp.asarray([[1, 1, 1], [1, -1, 0], [1, 1, -2]] / np.sqrt([[3.0], [2], [6]]))
+    turned = Box(jnp.zeros(3), jnp.ones(3), axes, jnp.ones(3, bool))
+    upright = dataclasses.replace(turned, axes=jnp.eye(3))
+    least = TELLS + np.log(PIXELS / PIXELS_PER_POINT) - PLANE_BONUS / SCORE_WORTH
+    scores = {"box": 0.0, "plane": least - 0.1, "sphere": 100.0}
+    assert told(scores, body=upright).kind == "box"
+    assert told(scores, body=turned).kind == "unknown"
+    assert told(scores | {"plane": least + 0.1}, body=turned).kind == "box"
