@@ -23,6 +23,7 @@ from jaxfuzzy.matcher import Matcher, chosen
 from jaxfuzzy.objects import OF_SCENE, PIXELS_PER_POINT
 from jaxfuzzy.occlusion import with_hidden_ends
 from jaxfuzzy.outline import sight_of, without_seen_through
+from jaxfuzzy.patches import level_patches
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.pieces import without_pieces
 from jaxfuzzy.primitives import Plane
@@ -332,6 +333,7 @@ def _model(
             if agreed is not None:
                 vertical = agreed.up
                 shapes = upright_again(shapes, agreed, stood)
+            shapes = level_patches(places, members, shapes, np.asarray(vertical, float), eye)
         shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
         if eye is not None:
             shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)

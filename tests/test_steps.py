@@ -108,3 +108,13 @@ def test_a_group_that_a_surface_holds_is_not_asked_about():
     named = (fitted_shape(Sphere(center=np.zeros(3), radius=np.array(1.0)), np.ones(len(own), bool), NOISE),)
     never = lambda *_: pytest.fail("asked")
     assert by_steps(points, parts, named, lambda sets, *_: (), never, FEWEST) == (parts, named)
+
+
+def test_a_piece_that_is_nearly_the_whole_group_is_not_fitted_again():
+    points = np.random.default_rng(0).uniform(0, 1, (600, 3))
+    parts = segment(points, ks=(1,))
+    own = members_of(parts)[0]
+    whole = (fitted_shape(None, np.zeros(len(own), bool), NOISE),)
+    most = len(own) - len(own) // 20
+    never = lambda *_: pytest.fail("fitted")
+    assert by_steps(points, parts, whole, never, lambda *_: [own[:most], own[most:]], FEWEST) == (parts, whole)
