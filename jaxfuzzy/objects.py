@@ -30,6 +30,10 @@ GOLDEN = 0.6180339887498949
 LEAN = 0.1745
 # An extent below this share of the largest is none: the object is seen edge on.
 EDGE_ON = 1e-3
+# Rows of an object at a compiled size; the last begins with six numbers: the camera's place, the range of depth, whether deviations
+# are given, the lean.
+POINTS, RAYS, GAIN, WEIGHT, ALONE, ROWS = slice(0, 3), slice(3, 6), 6, 7, 8, 9
+ALONES = 6
 # So many places along width and height of an object tell its points apart, by their bits.
 PLACES, SHIFTS = 2**16 - 1, ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555))
 # Of objects with many points so many are drawn, by a lot that changes over a small part of the spacing of points.
@@ -239,25 +243,35 @@ def upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
     return np.array([[b * f - c * e, c * d - a * f, a * e - b * d], up, level])
 
 
-def padded(item: Prepared | None, capacity: int, dtype: Any) -> dict[str, np.ndarray]:
-    """An object at a compiled size: weight 0 and a finite filler where there is no point; of larger ones a fair sample."""
-    object_ = {
-        "points": np.zeros((3, capacity), dtype),
-        "rays": np.zeros((3, capacity), dtype),
-        "gain": np.ones(capacity, dtype),
-        "weight": np.zeros(capacity, dtype),
-        "eye": np.zeros(3, dtype),
-        "depth_range": np.ones((), dtype),
-        "given": np.ones((), bool),
-        "lean": np.ones((), dtype),
-    }
+def padded(item: Prepared | None, capacity: int, dtype: Any) -> np.ndarray:
+    """An object at a compiled size: weight 0 and a finite filler where there is no point; of larger ones a fair sample.
+
+    It is one array of `ROWS` rows, since each array that is handed to a program costs as much as many numbers; `opened` undoes it.
+    """
+    object_ = np.zeros((ROWS, capacity), dtype)
+    object_[GAIN] = 1
+    object_[ALONE, :ALONES] = 0, 0, 0, 1, 1, 1
     if item is not None:
         n = min(len(item.points), capacity)
-        object_["points"][:, :n], object_["rays"][:, :n] = item.points[:n].T, item.rays[:n].T
-        object_["gain"][:n], object_["weight"][:n] = item.gain[:n], item.weight[:n]
-        for name in ("eye", "depth_range", "given", "lean"):
-            object_[name][...] = getattr(item, name)
+        object_[POINTS, :n], object_[RAYS, :n] = item.points[:n].T, item.rays[:n].T
+        object_[GAIN, :n], object_[WEIGHT, :n] = item.gain[:n], item.weight[:n]
+        object_[ALONE, :ALONES] = *item.eye, item.depth_range, item.given, item.lean
     return object_
+
+
+def opened(object_: Any) -> dict[str, Any]:
+    """The parts of an object as `padded` makes it, by NumPy or traced."""
+    eye, (depth_range, given, lean) = object_[ALONE, :3], object_[ALONE, 3:ALONES]
+    return {
+        "points": object_[POINTS],
+        "rays": object_[RAYS],
+        "gain": object_[GAIN],
+        "weight": object_[WEIGHT],
+        "eye": eye,
+        "depth_range": depth_range,
+        "given": given > 0,
+        "lean": lean,
+    }
 
 
 def capacity_for(count: int) -> int:

@@ -13,7 +13,7 @@ ORDER = """
     arrays status checks files linalg memberships tiles solve alternation blocks fcm embedding
     varietystep varietyresult varietyblocks varieties conditioning
     seeding validity density segment meshes primitives refine recover bodies simulate
-    objects rays bounds starts local choice candidates screening finalists search polish fitting looks assembly mostpoints
+    packing objects rays bounds starts local choice candidates screening finalists search polish fitting looks assembly mostpoints
     quadrics
     shapes trials joining dividing groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate brightness stereo render
