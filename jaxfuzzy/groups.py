@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from jaxfuzzy.arrays import on_device
+from jaxfuzzy.arrays import on_device, product
 from jaxfuzzy.dividing import SMALLEST, Parted, Stepped, cut_in_two, left_over, with_left_over
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.joining import parts_of_one_body
@@ -50,7 +50,7 @@ def by_shapes(
     """
     parts, shapes, gathered = _gathered(points, parts, shapes, fit)
     members = members_of(parts)
-    flat = points @ across.T
+    flat = product(points, across.T)
     up = np.cross(*across)
     joined = parts_of_one_body(points, flat, members, shapes, fit, camera, up)
     taken = gathered.union(*joined)
@@ -168,7 +168,7 @@ def _rebuilt(
     pick = np.zeros((u.shape[1], len(groups)), u.dtype)
     for i, k in enumerate(came_from):
         pick[k, i] = came_from.index(k) == i
-    memberships, noise = u @ pick, np.array(parts.partition.noise)
+    memberships, noise = product(u, pick), np.array(parts.partition.noise)
     size, centers, spare = [], [], np.zeros(len(points) if into else 0, u.dtype)
     for i, (own, _, k) in enumerate(groups):
         sources = [k, *(b for b, a in into.items() if a == k)]

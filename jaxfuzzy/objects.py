@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfuzzy.arrays import extents, lengths
+from jaxfuzzy.arrays import extents, lengths, product
 
 # A noise distance is so many standard deviations; residuals are searched and weighed in deviations.
 DEVIATIONS = 2.5
@@ -104,7 +104,7 @@ def prepared(
     if camera is not None and (camera - middle) @ up < 0:
         up = -up
     turn = upright(up, np.zeros(3) if camera is None else middle - camera)
-    q = (p - middle) @ turn.T
+    q = product(p - middle, turn.T)
     scatter = (q * share[:, None]).T @ q
     unit = float(np.sqrt(np.trace(scatter)))
     q /= unit if unit > 0 else 1.0
@@ -119,7 +119,7 @@ def prepared(
         depth = lengths(ray)
         ray /= np.maximum(depth, 1e-12)[:, None]
         # Without a better word the deviation of stereo grows with the square of the distance.
-        relative = (depth / (share @ depth)) ** 2
+        relative = (depth / (share * depth).sum()) ** 2
     gain = 1 / (relative if deviation is None else deviation[order] / (unit if unit > 0 else 1.0))
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter), 0))
     return Prepared(

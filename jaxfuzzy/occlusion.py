@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfuzzy.arrays import lengths, nth_smallest, on_device
+from jaxfuzzy.arrays import lengths, nth_smallest, on_device, product
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -153,7 +153,7 @@ def _reach(ray: np.ndarray) -> float:
     if len(ray) <= NEIGHBOURS:
         return 0.0
     some = ray[np.linspace(0, len(ray) - 1, min(len(ray), SAMPLE)).astype(int)]
-    square = np.maximum(2 - 2 * some @ ray.T, 0)
+    square = np.maximum(2 - 2 * product(some, ray.T), 0)
     return float(np.sqrt(np.median(nth_smallest(square, NEIGHBOURS))))
 
 
@@ -183,7 +183,7 @@ def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camer
         if np.linalg.norm(other.middle - middle) > other.wide + wide:
             continue
         near = 2 - 2 * other.ray @ middle < wide**2
-        close = 2 - 2 * view @ other.ray[near].T < reach**2
+        close = 2 - 2 * product(view, other.ray[near].T) < reach**2
         in_front = other.depth[near] < far[:, None] - CLEARLY * float(shape.noise_distance)
         nearer = np.maximum(nearer, (close & in_front).sum(axis=1))
     return bool((nearer >= IN_FRONT).mean() > BLOCKED)

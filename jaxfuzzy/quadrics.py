@@ -7,7 +7,7 @@ generalised eigenproblems A n = lambda B n of nine unknowns do; in plain NumPy, 
 
 import numpy as np
 
-from jaxfuzzy.arrays import on_device
+from jaxfuzzy.arrays import on_device, product
 from jaxfuzzy.objects import MOST, fair_order
 from jaxfuzzy.primitives import Quadric
 
@@ -45,7 +45,7 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
         mean = pull @ embedded
         offset = embedded - mean
         scatter = (offset * pull[:, None]).T @ offset
-        slope = (slopes * np.tile(pull, 3)[:, None]).T @ slopes
+        slope = product((slopes * np.tile(pull, 3)[:, None]).T, slopes)
         root = np.linalg.cholesky(slope + 1e-12 * np.trace(slope) * np.eye(9))
         half = np.linalg.solve(root, np.linalg.solve(root, scatter).T)
         normal = np.linalg.solve(root.T, np.linalg.eigh((half + half.T) / 2)[1][:, 0])
@@ -53,7 +53,7 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
     # Piece by piece, as nine dimensions of all points and their derivatives are much to hold.
     pieces = [_squared_distances(*_terms(p[i : i + MOST]), normal, mean) for i in range(0, len(p), MOST)]
     distance = np.sqrt(np.concatenate(pieces)) / delta
-    on, near = weights @ (distance <= 1), weights @ ((distance > 1) & (distance <= NEAR))
+    on, near = weights[distance <= 1].sum(), weights[(distance > 1) & (distance <= NEAR)].sum()
     if not np.isfinite(distance).all() or on < LEAST * weights.sum() or near > BEYOND * (near + on):
         return None
     inliers = (distance <= 1) & real

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, nth_smallest, on_device, record
+from jaxfuzzy.arrays import Array, ArrayLike, Float, Int, extents, nth_smallest, on_device, product, record
 from jaxfuzzy.density import DELTA, PROTOTYPES, SWEEPS, part
 from jaxfuzzy.fcm import Partition, fcm
 from jaxfuzzy.linalg import tangents
@@ -111,9 +111,9 @@ def _robust(x: np.ndarray, w: np.ndarray, axes: np.ndarray, candidates: tuple[in
     # A noise distance beyond the cloud's own extent says no more than that extent, and may overflow when squared.
     bandwidth = max(_bandwidth(x, w), min(noise, float(np.linalg.norm(extents(x)))))
     # The plane in its own frame, so that shifts and turns of the cloud change nothing.
-    flat = (x - np.average(x, axis=0, weights=w)) @ axes.T
+    flat = product(x - np.average(x, axis=0, weights=w), axes.T)
     turn = np.linalg.eigh((flat * w[:, None]).T @ flat)[1]
-    flat = flat @ turn
+    flat = product(flat, turn)
     able = [k for k in candidates if k <= PROTOTYPES[-1]]
     if not able:
         raise ValueError(f"ks must hold a number of at most {PROTOTYPES[-1]} for rule='robust', got {candidates}")
@@ -223,7 +223,7 @@ def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     crowd = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), CROWD)).astype(int)]
     probes = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), PROBES)).astype(int)]
     neighbour = min(NEIGHBOUR, len(crowd) - 1)
-    square = (probes**2).sum(axis=1)[:, None] + (crowd**2).sum(axis=1) - 2 * probes @ crowd.T
+    square = (probes**2).sum(axis=1)[:, None] + (crowd**2).sum(axis=1) - 2 * product(probes, crowd.T)
     reach = np.sqrt(np.maximum(nth_smallest(square, neighbour), 0))
     usual = np.quantile(reach, QUANTILE)
     # `neighbour` points within a disc of this radius: so much surface has each of the points that lie on a surface.
