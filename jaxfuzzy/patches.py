@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxfuzzy.arrays import on_device
+from jaxfuzzy.arrays import lengths, on_device
 from jaxfuzzy.bounds import stretch
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.shapes import Shape
@@ -17,6 +17,8 @@ from jaxfuzzy.shapes import Shape
 # A level rectangle may be so many times as large as the least one, both without so large a share of the points at either side: so
 # large is one about a square that is turned by five degrees.
 LARGER, ENDS = 1.1, (0.002, 0.998)
+# Sine of the angle below which a ray grazes the plane.
+GRAZING = 0.1
 # Sine of the tilt below which a plane lies level itself, so that no direction in it is level before others.
 FLAT = 0.05
 
@@ -53,6 +55,8 @@ def _level(on: np.ndarray, plane: Plane, up: np.ndarray, camera: np.ndarray | No
     if not len(on) or np.linalg.norm(level) < FLAT:
         return None
     ways = np.broadcast_to(normal, on.shape) if camera is None else on - camera
+    # A ray along the plane meets it nowhere near.
+    ways = np.where((np.abs(ways @ normal) > GRAZING * lengths(ways))[:, None], ways, normal)
     on = on - ways * ((on - middle) @ normal / (ways @ normal))[:, None]
     corners = np.asarray(plane.corners, float)
     places, least = (

@@ -83,3 +83,14 @@ def test_what_lies_flat_or_is_no_plane_stays():
     nothing = shape_of(rectangle(30), points[:0])
     own = np.arange(len(points))
     assert level_patches(points, [own, own, own[:0]], (lying, ball, nothing), UP, None) == (lying, ball, nothing)
+
+
+def test_a_plane_seen_edge_on_has_its_points_dropped_on_it():
+    corners = rectangle(45)
+    points = filled(corners) + 0.001 * np.random.default_rng(1).standard_normal((4000, 1)) * NORMAL
+    # Rays along the plane, nearly or to the last digit, meet it anywhere.
+    for eye in (MIDDLE - 2 * ACROSS, MIDDLE - 2 * ACROSS + 0.001 * NORMAL):
+        disc = points[np.linalg.norm(points - MIDDLE, axis=1) < 0.3]
+        patch = np.asarray(leveled(disc, shape_of(corners, disc), eye).corners)
+        assert np.abs(patch - MIDDLE).max() < 0.35
+        assert np.linalg.norm(patch[1] - patch[0]) > 0.5
