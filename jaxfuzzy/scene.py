@@ -14,7 +14,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, lengths, on_device, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
-from jaxfuzzy.flecks import in_flecks
+from jaxfuzzy.flecks import in_flecks, pixels_a_point
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.groups import by_shapes, by_steps, members_of
 from jaxfuzzy.linalg import tangents
@@ -293,9 +293,9 @@ def _model(
             return np.asarray(segment(places[of], **seen(own[of])).labels)
 
         def stepped(of: np.ndarray, noise: float) -> list[np.ndarray]:
-            return [
-                of[i] for i in between_steps(np.asarray(cloud.pixels_px)[own[of]], lengths(places[of] - eye), noise)
-            ]
+            pixels = np.asarray(cloud.pixels_px)
+            each = pixels_a_point(pixels)
+            return [of[i] for i in between_steps(pixels[own[of]], lengths(places[of] - eye), noise, each)]
 
         def as_kinds(of: Sequence[int], kinds: Sequence[str]) -> tuple[Shape, ...]:
             return in_independent_points(fits.shapes_as([members[i] for i in of], kinds), OF_SCENE)

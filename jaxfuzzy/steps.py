@@ -7,18 +7,18 @@ begins. Neighboring pixels belong to one piece where their depths differ by no m
 import cv2
 import numpy as np
 
-from jaxfuzzy.flecks import GAP, SPARSE, pixels_a_point
+from jaxfuzzy.flecks import GAP, SPARSE
 
 
-def between_steps(pixels: np.ndarray, depth: np.ndarray, noise: float) -> list[np.ndarray]:
+def between_steps(pixels: np.ndarray, depth: np.ndarray, noise: float, each: float) -> list[np.ndarray]:
     """Indices of the points of each piece, the largest first; none where points are too sparse to have neighbors.
 
     Args:
         pixels: Column and row of each point (N, 2).
         depth: Its distance from the camera (N,).
         noise: The noise distance.
+        each: How many pixels of the picture there are to each of its points, as `flecks.pixels_a_point` tells.
     """
-    each = pixels_a_point(pixels)
     if not each <= SPARSE:
         return []
     # In cells of so many pixels, each as deep as one of its points: gaps of single pixels part nothing.

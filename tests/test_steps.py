@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxfuzzy.flecks import pixels_a_point
 from jaxfuzzy.groups import by_steps, members_of
 from jaxfuzzy.primitives import Sphere
 from jaxfuzzy.segment import segment
@@ -23,7 +24,7 @@ def picture(every=1):
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_step_parts_and_a_slant_does_not(every):
     pixels, depth = picture(every)
-    first, second = between_steps(pixels, depth, NOISE)
+    first, second = between_steps(pixels, depth, NOISE, every**2)
     # The larger comes first, and cells of a few pixels lie astride of the edge.
     assert pixels[first, 0].max() < 40 + 2 * every
     assert pixels[second, 0].min() > 39 - 2 * every
@@ -33,22 +34,33 @@ def test_a_step_parts_and_a_slant_does_not(every):
 
 def test_a_step_of_less_than_the_noise_parts_nothing():
     pixels, depth = picture()
-    assert len(between_steps(pixels, depth, 0.2)) == 1
+    assert len(between_steps(pixels, depth, 0.2, 1)) == 1
     # A slant by more than that a pixel is one step after another, from cell to cell of two pixels.
-    assert len(between_steps(pixels, depth, 0.2 * NOISE)) == 20 + 1
+    assert len(between_steps(pixels, depth, 0.2 * NOISE, 1)) == 20 + 1
 
 
 def test_pixels_that_were_not_matched_part_nothing_but_a_gap_does():
     pixels, depth = picture()
     some = (pixels[:, 0] % 2 == 0) | (pixels[:, 1] % 2 == 0)
-    assert len(between_steps(pixels[some], depth[some], NOISE)) == 2
+    assert len(between_steps(pixels[some], depth[some], NOISE, 4 / 3)) == 2
     gap = (pixels[:, 0] >= 12) & (pixels[:, 0] < 20)
-    assert [len(of) for of in between_steps(pixels[~gap], depth[~gap], NOISE)] == [900, 600, 360]
+    assert [len(of) for of in between_steps(pixels[~gap], depth[~gap], NOISE, 1)] == [900, 600, 360]
 
 
 def test_what_is_no_picture_has_no_pieces():
     generator = np.random.default_rng(0)
-    assert between_steps(generator.uniform(0, 1000, (500, 2)), generator.uniform(1, 2, 500), NOISE) == []
+    scattered = generator.uniform(0, 1000, (500, 2))
+    assert between_steps(scattered, generator.uniform(1, 2, 500), NOISE, pixels_a_point(scattered)) == []
+
+
+def test_a_group_that_leaves_much_of_its_box_empty_is_as_dense_as_its_picture():
+    rows, columns = (a.ravel() for a in np.indices((100, 100)))
+    frame = np.maximum(np.abs(rows - 49.5), np.abs(columns - 49.5)) > 44
+    pixels = np.stack([columns, rows], axis=1)[frame].astype(float)
+    # The right half stands three noise distances behind: no step for cells of five pixels, which its own box would have.
+    depth = np.where(pixels[:, 0] < 50, 1.0, 1 + 3 * NOISE)
+    assert pixels_a_point(pixels) > 4
+    assert [len(of) for of in between_steps(pixels, depth, NOISE, 1)] == [len(pixels) // 2] * 2
 
 
 @pytest.mark.parametrize(("held", "number"), [(0.9, 2), (0.6, 1)])
