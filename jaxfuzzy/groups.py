@@ -105,7 +105,7 @@ def by_steps(
     groups: list[tuple[np.ndarray, Shape, int]] = []
     for k, both in enumerate(zip(members, shapes, strict=True)):
         # A rest that is too small to be an object is none.
-        of = [(own, shape) for own, shape in divided.get(k, [both]) if k not in divided or len(own) >= least]
+        of = [part for part in divided[k] if len(part[0]) >= least] if k in divided else [both]
         groups += [(own, shape, k) for own, shape in of]
     return _rebuilt(points, parts, groups, {}), tuple(shape for _, shape, _ in groups)
 

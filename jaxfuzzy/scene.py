@@ -293,9 +293,8 @@ def _model(
             return np.asarray(segment(places[of], **seen(own[of])).labels)
 
         def stepped(of: np.ndarray, noise: float) -> list[np.ndarray]:
-            pixels = np.asarray(cloud.pixels_px)
-            each = pixels_a_point(pixels)
-            return [of[i] for i in between_steps(pixels[own[of]], lengths(places[of] - eye), noise, each)]
+            pixels = np.asarray(cloud.pixels_px)[own[of]]
+            return [of[i] for i in between_steps(pixels, lengths(places[of] - eye), noise, spacing)]
 
         def as_kinds(of: Sequence[int], kinds: Sequence[str]) -> tuple[Shape, ...]:
             return in_independent_points(fits.shapes_as([members[i] for i in of], kinds), OF_SCENE)
@@ -308,6 +307,7 @@ def _model(
             return in_independent_points(found, OF_SCENE) if correlated else found
 
         least = FEWEST_PIXELS if correlated else FEWEST
+        spacing = pixels_a_point(np.asarray(cloud.pixels_px)) if correlated else np.inf
         shapes = fit(members)
         if segment_rule == "robust" and "ks" not in options:
             across = np.asarray(tangents(vertical))
