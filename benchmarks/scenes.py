@@ -16,6 +16,7 @@ import cv2
 import jax
 import numpy as np
 from common import RESULTS, provenance, table, timings, write
+from spoilt import SPOILT
 
 import jaxfuzzy as jf
 from jaxfuzzy.photos import read_pair
@@ -211,7 +212,7 @@ def photographs(data: Path) -> dict[str, Any]:
 
 
 def variants(data: Path) -> dict[str, Any]:
-    """Places named rightly in the photographs mirrored, smaller, darker on one side, and with other last digits."""
+    """Places named rightly in the photographs mirrored, smaller, darker on one side, noisy, compressed, and with other last digits."""
     rows = []
     for name, (folder, *images) in PHOTOGRAPHS.items():
         places = [place[1:] for place in PLACES if place[0] == name]
@@ -234,6 +235,8 @@ def variants(data: Path) -> dict[str, Any]:
         )
         at["smaller"] = (jf.model_scene(*small, rig.scaled(size)), lambda x, y, _: (SMALLER * x, SMALLER * y))
         at["right image darker"] = (jf.model_scene(left, dark, rig), lambda x, y, _: (x, y))
+        for change, spoil in SPOILT.items():
+            at[change] = (jf.model_scene(*spoil(left, right), rig), lambda x, y, _: (x, y))
         for draw in range(DRAWS):
             noise = np.random.default_rng(draw).standard_normal(plain.cloud.points.shape)
             points = (np.asarray(plain.cloud.points) * (1 + LAST_DIGIT * noise)).astype(np.float32)

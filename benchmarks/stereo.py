@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 from common import provenance, table, timings, write
+from spoilt import SPOILT
 
 from jaxfuzzy.calibrate import calibrate
 from jaxfuzzy.checks import DataError
@@ -153,6 +154,31 @@ def brightness(data: Path) -> dict[str, Any]:
     return results
 
 
+def spoilt(data: Path) -> dict[str, Any]:
+    """The same pairs noisy and compressed: means over the scenes."""
+    ways: dict[str, Matcher | None] = {"bare OpenCV": None, "default": Matcher(), "unrefined": Matcher(refine=False)}
+    rows: dict[str, dict[str, list[dict[str, float]]]] = {change: {who: [] for who in ways} for change in SPOILT}
+    for _, left, right, truth, rig, count in pairs(data):
+        for change, spoil in SPOILT.items():
+            images = spoil(left, right)
+            for who, matcher in ways.items():
+                found = bare(*images, count) if matcher is None else disparity(*images, rig, matcher=matcher)
+                rows[change][who].append(judged(*found, truth))
+    results = {
+        change: {
+            who: {name: float(np.mean([row[name] for row in each])) for name in FIGURES[:-1]}
+            for who, each in of.items()
+        }
+        for change, of in rows.items()
+    }
+    table(
+        f"Noisy and compressed pictures, mean of {len(SCENES)} scenes",
+        ("pictures", "matched by", *FIGURES[:-1]),
+        [(change, who, *figures.values()) for change, of in results.items() for who, figures in of.items()],
+    )
+    return results
+
+
 def full_size(data: Path) -> dict[str, Any]:
     """The full-size cones, whose truth is four times that of the quarter-size pair, enlarged."""
     folder = data / "middlebury2003_cones_full"
@@ -228,7 +254,7 @@ def calibration(data: Path) -> dict[str, Any]:
 
 
 PARTS = {
-    "matching": matching, "brightness": brightness, "full_size": full_size, "rendered": rendered,
+    "matching": matching, "brightness": brightness, "spoilt": spoilt, "full_size": full_size, "rendered": rendered,
     "duration": duration, "calibration": calibration,
 }  # fmt: skip
 

@@ -24,10 +24,10 @@ Stepped = Callable[[np.ndarray, float], list[np.ndarray]]
 WHOLE, EXPLAINED, GAINED = 0.8, 0.7, 0.15
 # Two flat strips hold much of anything round: of a cone behind another one they held 0.84 where it held 0.67.
 GAINED_FLAT = 0.25
-# A part with a smaller share of its group is no object.
+# A part with a smaller share of its group, or of what the surface of that holds, is no object.
 SMALLEST = 0.1
-# A surface that holds less than the first share of its group is that of a part of it: what it leaves over is something else,
-# whatever that is, where it holds the second share together.
+# A surface that holds less than the first share of its group is that of a part of it: what it leaves over is something else. Parts
+# with so large a share of what the surface holds are then objects, whatever they are.
 MIXED, LARGE = 0.6, 0.2
 # A group is cut by so many of its places, with repetition where it has fewer, so that one program serves all.
 PLACES = 1024
@@ -142,21 +142,25 @@ def with_left_over(
 ) -> dict[int, list[tuple[np.ndarray, Shape]]]:
     """Groups of which a surface holds a part and others hold parts of what it leaves over: what stays with it, and these.
 
-    Where a surface holds less than `MIXED` of a group, `nameless` takes large parts that no surface holds as well.
+    Where a surface holds less than `MIXED` of a group, large parts that no surface holds are taken as well; where there are no
+    others, `nameless` says whether.
     """
-    if nameless:
-        parts = {k: of for k, of in parts.items() if held_by(shapes[k]) < MIXED * len(members[k])}
-    smallest = LARGE if nameless else SMALLEST
-    left = [
-        (k, piece) for k, of in parts.items() for piece in of if len(piece) >= max(fewest, smallest * len(members[k]))
-    ]
-    others: dict[int, list[tuple[np.ndarray, Shape]]] = {}
+    held = {k: held_by(shapes[k]) for k in parts}
+    mixed = {k for k in parts if shapes[k].primitive is not None and held[k] < MIXED * len(members[k])}
+    # Parts are small beside what the surface holds: a group of which it holds little may be a heap of objects.
+    beside = {k: held[k] or len(members[k]) for k in parts}
+    left = [(k, piece) for k, of in parts.items() for piece in of if len(piece) >= max(fewest, SMALLEST * beside[k])]
+    named: dict[int, list[tuple[np.ndarray, Shape]]] = {}
+    large: dict[int, list[tuple[np.ndarray, Shape]]] = {}
     for (k, piece), shape in zip(left, fit([piece for _, piece in left]) if left else (), strict=True):
         whole = shape.primitive is not None and held_by(shape) >= EXPLAINED * len(piece)
-        if nameless and not whole and shape.primitive is not None:
+        if not whole and (k not in mixed or len(piece) < LARGE * beside[k]):
+            continue
+        if not whole and shape.primitive is not None:
             shape = refused(shape, Status(0), "it holds too little of what another surface leaves over")
-        if (whole or nameless) and not contained(points, [members[k], piece], [shapes[k], shape]):
-            others.setdefault(k, []).append((piece, shape))
+        if not contained(points, [members[k], piece], [shapes[k], shape]):
+            (named if whole else large).setdefault(k, []).append((piece, shape))
+    others = {k: named.get(k, []) + large.get(k, []) for k in parts if k in named or (nameless and k in large)}
     stay = {k: np.setdiff1d(members[k], np.concatenate([piece for piece, _ in of])) for k, of in others.items()}
     anew = fit(list(stay.values())) if stay else ()
     found = {}

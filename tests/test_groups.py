@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfuzzy.checks import DataError
-from jaxfuzzy.dividing import _of_pieces
+from jaxfuzzy.dividing import _of_pieces, with_left_over
 from jaxfuzzy.groups import by_shapes
 from jaxfuzzy.joining import _seen_from, _way_hidden, parts_of_one_body
 from jaxfuzzy.primitives import Cylinder, Plane, Sphere
@@ -184,6 +184,37 @@ def test_what_a_body_leaves_over_is_another_object_where_it_is_nearly_half(share
     if len(kinds) == 2:
         assert (labels[:count] == 0).mean() > 0.95
         assert (labels[count:] == 1).mean() > 0.9
+
+
+@pytest.mark.parametrize(("held", "found"), [(0.25, [1270, 150, 150, 130, 300]), (0.8, [2000])])
+def test_parts_of_a_heap_are_small_beside_what_its_surface_holds(held, found):
+    """Pieces of 150 and 130 are less than a tenth of a group of 2000, but more of the 500 that a surface of it holds."""
+    points = np.random.default_rng(0).uniform(0, 1, (2000, 3))
+    own = np.arange(2000)
+    flat = Plane(np.zeros(3), np.array([0.0, 1.0, 0.0]), np.zeros((4, 3)))
+    heap = fitted_shape(flat, own < held * 2000, 0.005)
+    # The last three have no name: the first is large enough to be an object beside others, the next is not, nor is the third.
+    pieces = [own[1000:1150], own[1150:1300], own[1300:1430], own[1500:1800], own[1800:1890], own[1900:1940]]
+    names = (150, 150, 130)
+
+    def fit(sets):
+        named = [len(of) in names for of in sets]
+        body = Sphere(center=np.full(3, 9.0), radius=np.array(0.1))
+        return tuple(
+            fitted_shape(body if yes else None, np.full(len(of), yes), 0.005)
+            for yes, of in zip(named, sets, strict=True)
+        )
+
+    parts = with_left_over(points, [own], [heap], {0: pieces}, fit, 60)
+    sizes = [len(of) for of, _ in parts[0]] if parts else [len(own)]
+    assert sizes == found
+    if parts:
+        assert [shape.kind for _, shape in parts[0]] == ["plane", "sphere", "sphere", "sphere", "unknown"]
+    # Where no part has a name, large ones are objects where that is asked for.
+    names = ()
+    assert not with_left_over(points, [own], [heap], {0: pieces}, fit, 60)
+    nameless = with_left_over(points, [own], [heap], {0: pieces}, fit, 60, nameless=True)
+    assert [len(of) for of, _ in nameless.get(0, [])] == ([1270, 150, 150, 130, 300] if held < 0.6 else [])
 
 
 def wall(radius, toward, count=500, seed=0):
