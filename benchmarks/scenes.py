@@ -212,7 +212,7 @@ def photographs(data: Path) -> dict[str, Any]:
 
 
 def variants(data: Path) -> dict[str, Any]:
-    """Places named rightly in the photographs mirrored, smaller, darker on one side, noisy, compressed, and with other last digits."""
+    """Places named rightly in the photographs mirrored, smaller, darker on one side, noisy, compressed, with other last digits."""
     rows = []
     for name, (folder, *images) in PHOTOGRAPHS.items():
         places = [place[1:] for place in PLACES if place[0] == name]
