@@ -36,10 +36,12 @@ COARSE_WIDTH, COARSE_BLOCK = 320, 3  # the disparity range is looked for on imag
 RANGE_SHARE = 0.002  # share of coarse matches left out at either end of the range
 MISSED_SHARE = 0.1  # of coarse matches outside a range that was given, from which on that is told
 WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
-# And of its second step, for disparities that differ from their smoother neighborhood by more than such a share of their usual
-# deviation: of twelve real scenes as they are 0.14 to 0.24, with noise of 4 grey levels 0.27 to 0.50, as JPEG of quality 60 0.35 to
-# 0.47.
-WIDER_WINDOW_PX, WIDER_SMOOTHING_PX, FURTHER_PX, ROUGH = 2.5, 4.0, 1.0, 0.31
+# Where noise or compression leaves disparities rough, images are smoothed over so many pixels, among so similar grey levels, and
+# matched once more, and refined by a second step. Rough are those that differ from their smoother neighborhood by more than such a
+# share of their usual deviation: of twelve real scenes as they are 0.14 to 0.24, with noise of 4 grey levels 0.27 to 0.50, as JPEG
+# of quality 60 0.35 to 0.47.
+NOISE_PX, NOISE_LEVELS, ROUGH = 1.5, 15.0, 0.31
+WIDER_WINDOW_PX, WIDER_SMOOTHING_PX, FURTHER_PX = 2.5, 4.0, 1.0
 NORMAL_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
@@ -124,6 +126,20 @@ def _matched(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[Arr
     """Disparities of a pair that is one."""
     low, count, to_left = _glance(left, right, rig, matcher)
     left, right = evened(left, right, to_left)
+    values, valid = _answered(left, right, rig, low, count, matcher)
+    if matcher.refine and valid.any():
+        values, rough = _refined(left, right, values, valid)
+        if rough:
+            left, right = (cv2.bilateralFilter(image, -1, NOISE_LEVELS, NOISE_PX) for image in (left, right))
+            values, valid = _answered(left, right, rig, low, count, matcher)
+            values, _ = _refined(left, right, values, valid, rough=True) if valid.any() else (values, rough)
+    return on_device(np.where(valid, values, np.float32(np.nan))), on_device(valid)
+
+
+def _answered(
+    left: Image, right: Image, rig: Rig, low: int, count: int, matcher: Matcher
+) -> tuple[np.ndarray, np.ndarray]:
+    """Disparities (H, W) in sixteenths of a pixel, and which of them stand every check."""
     values = _match(left, right, low, count, matcher)
     valid = (values >= low) & (values + rig.doffs_px > 0) & _textured(left)
     if matcher.left_right_px is not None:
@@ -133,9 +149,7 @@ def _matched(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[Arr
         valid &= ~_edges(values, valid, matcher.edge_px)
     if matcher.speckle_px:
         valid = _without_speckles(values, valid, matcher.speckle_px)
-    if matcher.refine and valid.any():
-        values = _refined(left, right, values, valid)
-    return on_device(np.where(valid, values, np.float32(np.nan))), on_device(valid)
+    return values, valid
 
 
 def search_range(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int, int]:
@@ -286,12 +300,14 @@ def _without_speckles(values: np.ndarray, valid: np.ndarray, area: int, jump: in
     return valid & (fixed != gone)
 
 
-def _refined(left: Image, right: Image, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Disparities moved by a step of Lucas and Kanade (IJCAI 1981), between two edge-keeping means.
+def _refined(
+    left: Image, right: Image, values: np.ndarray, valid: np.ndarray, *, rough: bool = False
+) -> tuple[np.ndarray, bool]:
+    """Disparities moved by a step of Lucas and Kanade (IJCAI 1981), between two edge-keeping means; and if they are rough.
 
     The step minimises the squared difference of left and shifted right image, less its mean (brightness may differ), over
-    a Gaussian window. The means are bilateral: a neighbor counts less the further its disparity is. Where pictures are noisy, or
-    were compressed, disparities are rough after that: then a second step follows, of a wider window and between wider means.
+    a Gaussian window. The means are bilateral: a neighbor counts less the further its disparity is. `rough` ones are moved by
+    a second step, of a wider window and between wider means.
     """
     left, right = (grey(image).astype(np.float32) for image in (left, right))
     columns, rows = np.meshgrid(*(np.arange(size, dtype=np.float32) for size in left.shape[::-1]))
@@ -315,11 +331,11 @@ def _refined(left: Image, right: Image, values: np.ndarray, valid: np.ndarray) -
 
     new = moved(mean(values, SMOOTHING_PX), WINDOW_PX, LARGEST_STEP_PX)
     smooth = mean(new, SMOOTHING_PX)
-    rough = NORMAL_MEDIAN * np.median(np.abs(new - smooth)[valid])
-    if rough > ROUGH * usual_std_px(len(values)):
+    if rough:
         new = moved(mean(new, WIDER_SMOOTHING_PX), WIDER_WINDOW_PX, FURTHER_PX)
         smooth = mean(new, WIDER_SMOOTHING_PX)
-    return np.where(valid, smooth, values)
+    unlike = NORMAL_MEDIAN * float(np.median(np.abs(new - smooth)[valid]))
+    return np.where(valid, smooth, values), unlike > ROUGH * usual_std_px(len(values))
 
 
 def example_pair() -> tuple[Path, Path, Rig]:
