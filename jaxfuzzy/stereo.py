@@ -126,13 +126,15 @@ def _matched(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[Arr
     """Disparities of a pair that is one."""
     low, count, to_left = _glance(left, right, rig, matcher)
     left, right = evened(left, right, to_left)
-    values, valid = _answered(left, right, rig, low, count, matcher)
-    if matcher.refine and valid.any():
-        values, rough = _refined(left, right, values, valid)
+    for rough in (False, True):
         if rough:
             left, right = (cv2.bilateralFilter(image, -1, NOISE_LEVELS, NOISE_PX) for image in (left, right))
-            values, valid = _answered(left, right, rig, low, count, matcher)
-            values, _ = _refined(left, right, values, valid, rough=True) if valid.any() else (values, rough)
+        values, valid = _answered(left, right, rig, low, count, matcher)
+        if not (matcher.refine and valid.any()):
+            break
+        values, still = _refined(left, right, values, valid, rough)
+        if not still:
+            break
     return on_device(np.where(valid, values, np.float32(np.nan))), on_device(valid)
 
 
@@ -300,10 +302,8 @@ def _without_speckles(values: np.ndarray, valid: np.ndarray, area: int, jump: in
     return valid & (fixed != gone)
 
 
-def _refined(
-    left: Image, right: Image, values: np.ndarray, valid: np.ndarray, *, rough: bool = False
-) -> tuple[np.ndarray, bool]:
-    """Disparities moved by a step of Lucas and Kanade (IJCAI 1981), between two edge-keeping means; and if they are rough.
+def _refined(left: Image, right: Image, values: np.ndarray, valid: np.ndarray, rough: bool) -> tuple[np.ndarray, bool]:
+    """Disparities moved by a step of Lucas and Kanade (IJCAI 1981), between two edge-keeping means; and if they are rough then.
 
     The step minimises the squared difference of left and shifted right image, less its mean (brightness may differ), over
     a Gaussian window. The means are bilateral: a neighbor counts less the further its disparity is. `rough` ones are moved by

@@ -347,7 +347,6 @@ def test_disparities_that_noise_leaves_rough_are_smoothed_further(table, spoilt,
         assert answered[0] > answered[1]
 
 
-
 def test_levels_of_matching_pixels_by_hand():
     levels = np.arange(0.0, 200.0)[:, None]
     line = line_between(levels, 0.8 * levels + 12)
