@@ -40,8 +40,8 @@ WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
 # matched once more, and refined by a second step. Rough are those that differ from their smoother neighborhood by more than such a
 # share of their usual deviation: of twelve real scenes as they are 0.14 to 0.24, with noise of 4 grey levels 0.27 to 0.50, as JPEG
 # of quality 60 0.35 to 0.47.
-NOISE_PX, NOISE_LEVELS, ROUGH = 1.5, 15.0, 0.31
-WIDER_WINDOW_PX, WIDER_SMOOTHING_PX, FURTHER_PX = 2.5, 4.0, 1.0
+NOISE_PX, NOISE_LEVELS, ROUGH = 1.5, 15.0, 0.36
+WIDER_WINDOW_PX, WIDER_SMOOTHING_PX, FURTHER_PX = 2.5, 3.5, 1.0
 NORMAL_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 

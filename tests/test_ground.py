@@ -172,6 +172,29 @@ def test_a_wavy_cloth_is_called_a_slab():
     assert float(ground.spread) > 1.3
 
 
+@pytest.mark.parametrize("filled", [True, False])
+def test_a_plane_of_which_little_is_seen_is_not_believed_to_tell_much_noise(filled):
+    """A table with four times the noise told tells it where it fills the view; of a small patch a bend may tell as much."""
+    points, what, std, up, _ = scene(0.5, balls=(), wall=0.6)
+    rng = np.random.default_rng(1)
+    on_table = np.flatnonzero(what == TABLE)
+    if not filled:
+        # All of it but a small patch is seen as a wall does that stands behind.
+        middle = points[on_table].mean(axis=0)
+        off = points[on_table] - middle
+        points = np.delete(points, on_table[np.abs(off[:, 0]) + np.abs(off[:, 2]) > 0.09], axis=0)
+        std = np.delete(std, on_table[np.abs(off[:, 0]) + np.abs(off[:, 2]) > 0.09])
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    noisy = points + 4 * (std * rng.standard_normal(len(points)))[:, None] * ray
+    ground = fit_ground(noisy, up=up, depth_std=std)
+    assert ground.plane is not None
+    assert angle(ground.plane.normal, up) < 10
+    assert float(ground.spread) == pytest.approx(4.0, rel=0.15)
+    assert (float(ground.support) > 0.03) == filled
+    told = np.asarray(ground.depth_std) / std
+    np.testing.assert_allclose(told, float(ground.spread) if filled else 2.0, rtol=1e-3)
+
+
 def test_gravity_rules_out_what_leans():
     points, _, std, up, _ = scene(np.radians(25))
     assert find_ground(points, depth_std=std, max_tilt=np.radians(10)) is None
