@@ -147,6 +147,8 @@ def with_left_over(
     """
     held = {k: held_by(shapes[k]) for k in parts}
     mixed = {k for k in parts if shapes[k].primitive is not None and held[k] < MIXED * len(members[k])}
+    if nameless:  # parts with a name were asked for before
+        parts = {k: of for k, of in parts.items() if k in mixed}
     # Parts are small beside what the surface holds: a group of which it holds little may be a heap of objects.
     beside = {k: held[k] or len(members[k]) for k in parts}
     left = [(k, piece) for k, of in parts.items() for piece in of if len(piece) >= max(fewest, SMALLEST * beside[k])]
@@ -154,10 +156,11 @@ def with_left_over(
     large: dict[int, list[tuple[np.ndarray, Shape]]] = {}
     for (k, piece), shape in zip(left, fit([piece for _, piece in left]) if left else (), strict=True):
         whole = shape.primitive is not None and held_by(shape) >= EXPLAINED * len(piece)
-        if not whole and (k not in mixed or len(piece) < LARGE * beside[k]):
-            continue
-        if not whole and shape.primitive is not None:
-            shape = refused(shape, Status(0), "it holds too little of what another surface leaves over")
+        if not whole:
+            if k not in mixed or len(piece) < LARGE * beside[k]:
+                continue
+            if shape.primitive is not None:
+                shape = refused(shape, Status(0), "it holds too little of what another surface leaves over")
         if not contained(points, [members[k], piece], [shapes[k], shape]):
             (named if whole else large).setdefault(k, []).append((piece, shape))
     others = {k: named.get(k, []) + large.get(k, []) for k in parts if k in named or (nameless and k in large)}

@@ -22,7 +22,7 @@ from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.matcher import FURTHEST_PX, STEP, Matcher, chosen
 from jaxfuzzy.photos import Alignment, Image, alignment, grey, read_pair, rectify
-from jaxfuzzy.reproject import cloud_from_disparity, usual_std_px
+from jaxfuzzy.reproject import TO_STD, cloud_from_disparity, usual_std_px
 from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.status import Status
 
@@ -42,7 +42,6 @@ WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
 # of quality 60 0.35 to 0.47.
 NOISE_PX, NOISE_LEVELS, ROUGH = 1.5, 15.0, 0.36
 WIDER_WINDOW_PX, WIDER_SMOOTHING_PX, FURTHER_PX = 2.5, 3.5, 1.0
-NORMAL_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = None) -> Cloud:
@@ -334,7 +333,7 @@ def _refined(left: Image, right: Image, values: np.ndarray, valid: np.ndarray, r
     if rough:
         new = moved(mean(new, WIDER_SMOOTHING_PX), WIDER_WINDOW_PX, FURTHER_PX)
         smooth = mean(new, WIDER_SMOOTHING_PX)
-    unlike = NORMAL_MEDIAN * float(np.median(np.abs(new - smooth)[valid]))
+    unlike = TO_STD * float(np.median(np.abs(new - smooth)[valid]))
     return np.where(valid, smooth, values), unlike > ROUGH * usual_std_px(len(values))
 
 
