@@ -22,6 +22,7 @@ __all__ = [
     "Float",
     "Int",
     "Scalar",
+    "all_on_device",
     "as_float",
     "is_concrete",
     "on_device",
@@ -48,6 +49,13 @@ def on_device(value: Any, dtype: Any = None) -> Array:
         dtype: Its type; NumPy's own, in the precision of JAX, by default.
     """
     return jax.device_put(np.asarray(value, dtype))
+
+
+def all_on_device(tree: T) -> T:
+    """A record, or several, whose NumPy arrays are put on the device, all at once; plain numbers stay what they are."""
+    leaves, structure = jax.tree.flatten(tree)
+    arrays = iter(jax.device_put([leaf for leaf in leaves if isinstance(leaf, np.ndarray)]))
+    return jax.tree.unflatten(structure, [next(arrays) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves])
 
 
 def static(**kwargs: Any) -> Any:

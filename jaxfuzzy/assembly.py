@@ -35,7 +35,7 @@ def bounded(looks: Mapping[int, Look], settings: Settings) -> dict[int, Bounded]
     assembled = side_by_side(lambda s: jax.device_get(assemble_batch(*s)), surfaces)
     for (_, part), found in zip(parts, assembled, strict=True):
         for j, i in enumerate(part):
-            primitive, covariance = jax.tree.map(lambda a, j=j: a[j], found)
+            primitive, covariance = jax.tree.map(lambda a, j=j: np.asarray(a[j]), found)
             made[i] = Bounded(primitive, covariance, on[i])
     return made
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import jax
 import numpy as np
 
 from jaxfuzzy import checks
@@ -170,7 +169,7 @@ def with_left_over(
     for (k, own), shape in zip(stay.items(), anew, strict=True):
         if shape.primitive is None:  # what was named with the parts stays so without them
             inliers = np.asarray(shapes[k].inliers)[np.isin(members[k], own)]
-            shape = dataclasses.replace(shapes[k], inliers=jax.device_put(inliers))
+            shape = dataclasses.replace(shapes[k], inliers=inliers)
         found[k] = [(own, shape), *others[k]]
     return found
 

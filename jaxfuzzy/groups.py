@@ -149,7 +149,7 @@ def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Sha
     if shape.primitive is not None:
         inliers = distances(shape.primitive, points[every]) <= float(shape.noise_distance)
     inliers[np.isin(every, own)] = np.asarray(shape.inliers)
-    return dataclasses.replace(shape, inliers=jax.device_put(inliers))
+    return dataclasses.replace(shape, inliers=inliers)
 
 
 def _rebuilt(

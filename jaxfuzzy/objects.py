@@ -155,13 +155,15 @@ def fair_order(points: np.ndarray) -> np.ndarray:
 
 
 def _dealt(points: np.ndarray) -> np.ndarray:
-    # Points of one place on the curve by their own, whatever order they come in.
-    order = np.lexsort((points @ TO_LOT, _along_curve(points)))
+    along = _along_curve(points)
+    order = np.argsort(along)
+    if not np.diff(along[order]).all():  # points of one place on the curve by their own, whatever order they come in
+        order = np.lexsort((points @ TO_LOT, along))
     turn = np.arange(len(points)) * GOLDEN % 1.0
     # Those beyond what is ever fitted need no order.
     early = turn < MOST / len(points)
     first = np.flatnonzero(early)
-    return order[np.concatenate([first[np.argsort(turn[first], kind="stable")], np.flatnonzero(~early)])]
+    return order[np.concatenate([first[np.argsort(turn[first])], np.flatnonzero(~early)])]
 
 
 def _along_curve(points: np.ndarray) -> np.ndarray:

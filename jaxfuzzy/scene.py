@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, Float, Int, lengths, on_device, record, static
+from jaxfuzzy.arrays import Array, Float, Int, all_on_device, lengths, on_device, record, static
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
 from jaxfuzzy.flecks import in_flecks, pixels_a_point
@@ -345,7 +345,7 @@ def _model(
         up=on_device(vertical, points.dtype),
         ground=plane,
         segmentation=_of_all(parts, own, count),
-        shapes=shapes,
+        shapes=all_on_device(shapes),
         timings=clock.seconds,
         settings={name: _plain(value) for name, value in (settings | options).items()},
         status=on_device(status | int(parts.status), np.int32),

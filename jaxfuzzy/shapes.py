@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, on_device, record, static
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, all_on_device, record, static
 from jaxfuzzy.assembly import Bounded, bounded
 from jaxfuzzy.fitting import TOLERANCES, Fitted
 from jaxfuzzy.looks import Look, Settings, first_look, further_look, look_about, look_as, side_by_side, unfit
@@ -164,7 +164,7 @@ def fit_shapes(
         weights=weights,
     )
     shapes = fits.shapes(members)
-    return with_quadrics(np.asarray(array), members, shapes, weights)
+    return all_on_device(with_quadrics(np.asarray(array), members, shapes, weights))
 
 
 class Fits:
@@ -231,7 +231,7 @@ class Fits:
                 shapes.append(_by_most_points(*found))
             else:
                 arrays, told = _unknown(len(m), None, poor[i], self.settings)
-                shapes.append(Shape(**jax.device_put(arrays), **told))
+                shapes.append(Shape(**arrays, **told))
         return tuple(shapes)
 
     def shapes_as(self, members: Sequence[np.ndarray], kinds: Sequence[str]) -> tuple[Shape, ...]:
@@ -319,8 +319,8 @@ def with_quadrics(
         if shape.primitive is None and int(shape.status) & NO_QUADRIC == Status.REFUSED:
             found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
         if found is not None:
-            quadric = jax.tree.map(lambda a: on_device(a, points.dtype), found[0])
-            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=jax.device_put(found[1]))
+            quadric = jax.tree.map(lambda a: a.astype(points.dtype), found[0])
+            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=found[1])
         told.append(shape)
     return tuple(told)
 
@@ -344,14 +344,14 @@ def _by_most_points(
     if found.kind == "plane":
         status |= Status.MAY_BE_BOX
     return Shape(
-        primitive=jax.device_put(found.primitive),
-        inliers=on_device(found.inliers),
-        noise_distance=on_device(np.median(delta), settings.dtype),
+        primitive=found.primitive,
+        inliers=np.asarray(found.inliers),
+        noise_distance=np.asarray(np.median(delta), settings.dtype),
         scores=scores,
         margin=margin,
         counts=found.counts,
-        covariance=on_device(np.zeros((0, 0)), settings.dtype),
-        status=on_device(int(status), np.int32),
+        covariance=np.zeros((0, 0), settings.dtype),
+        status=np.asarray(status, np.int32),
         kind=found.kind,
         guards=guards,
     )
@@ -376,17 +376,15 @@ def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 
 
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:
-    """Shapes of all objects, their arrays handed to JAX at once."""
-    made = bounded(looks, settings)
-    arrays, rest = [], []
+    """Shapes of all objects."""
+    made, shapes = bounded(looks, settings), []
     for i, size in enumerate(sizes):
         if i in made:
             own, told = _named(looks[i], made[i], settings)
         else:
             own, told = _unknown(size, looks.get(i), Status(poor[i] or looks[i].reason), settings)
-        arrays.append(own)
-        rest.append(told)
-    return tuple(Shape(**own, **told) for own, told in zip(jax.device_put(arrays), rest, strict=True))
+        shapes.append(Shape(**own, **told))
+    return tuple(shapes)
 
 
 def _named(look: Look, made: Bounded, settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:

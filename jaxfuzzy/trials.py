@@ -4,10 +4,9 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-import jax
 import numpy as np
 
-from jaxfuzzy.arrays import lengths, on_device
+from jaxfuzzy.arrays import lengths
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -73,9 +72,9 @@ def refused(shape: Shape, status: Status, why: str) -> Shape:
         shape,
         kind="unknown",
         primitive=None,
-        inliers=jax.device_put(np.zeros(len(shape.inliers), bool)),
-        covariance=on_device(np.zeros((0, 0)), shape.covariance.dtype),
-        status=on_device(Status.REFUSED | status, np.int32),
+        inliers=np.zeros(len(shape.inliers), bool),
+        covariance=np.zeros((0, 0), shape.covariance.dtype),
+        status=np.asarray(Status.REFUSED | status, np.int32),
         guards=(*shape.guards, f"{shape.kind}: {why}"),
     )
 

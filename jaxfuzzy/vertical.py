@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfuzzy.arrays import on_device
 from jaxfuzzy.ground import Ground
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.objects import PIXELS_PER_POINT
@@ -164,7 +163,7 @@ def upright_again(
                 primitive=found.primitive,
                 inliers=found.inliers,
                 covariance=found.covariance,
-                status=on_device(status, np.int32),
+                status=np.asarray(status, np.int32),
             )
     return tuple(new)
 
