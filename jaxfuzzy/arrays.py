@@ -26,6 +26,7 @@ __all__ = [
     "as_float",
     "is_concrete",
     "on_device",
+    "on_host",
     "product",
     "record",
     "static",
@@ -49,6 +50,12 @@ def on_device(value: Any, dtype: Any = None) -> Array:
         dtype: Its type; NumPy's own, in the precision of JAX, by default.
     """
     return jax.device_put(np.asarray(value, dtype))
+
+
+def on_host(value: Any, dtype: Any = None) -> Array:
+    """A NumPy array for a record that is still worked on; `all_on_device` makes it what it is declared as."""
+    array: Any = np.asarray(value, dtype)
+    return array
 
 
 def all_on_device(tree: T) -> T:

@@ -103,13 +103,13 @@ def noise_distance(value: Any, count: int | None = None, name: str = "noise_dist
     return value
 
 
-def noise_distance_or_auto(value: Any, count: int) -> Any:
+def noise_distance_or_auto(value: Any, count: int | None = None) -> Any:
     """A noise distance, for all or for each of so many points; None for "auto", which something else must tell."""
     if isinstance(value, str):
         choice(value, "noise_distance", ("auto",))
         return None
     if value is None:
-        raise ValueError("noise_distance must be 'auto' or above 0, got None")
+        raise TypeError("noise_distance must be 'auto' or above 0, got None")
     return noise_distance(value, count)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from jaxfuzzy import checks
+from jaxfuzzy.arrays import on_host
 from jaxfuzzy.fcm import fcm
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.looks import ROUND, side_by_side
@@ -169,7 +170,7 @@ def with_left_over(
     for (k, own), shape in zip(stay.items(), anew, strict=True):
         if shape.primitive is None:  # what was named with the parts stays so without them
             inliers = np.asarray(shapes[k].inliers)[np.isin(members[k], own)]
-            shape = dataclasses.replace(shapes[k], inliers=inliers)
+            shape = dataclasses.replace(shapes[k], inliers=on_host(inliers))
         found[k] = [(own, shape), *others[k]]
     return found
 

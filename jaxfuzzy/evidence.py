@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxfuzzy.arrays import on_host
 from jaxfuzzy.choice import PLANE_BONUS
 from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.search import KINDS, MORE
@@ -73,7 +74,7 @@ def _in_independent_points(shape: Shape, fitted_to: int) -> Shape:
         shape,
         scores={kind: score / each for kind, score in shape.scores.items()},
         margin=shape.margin / each,
-        covariance=(np.asarray(shape.covariance) * common).astype(shape.covariance.dtype),
+        covariance=on_host(np.asarray(shape.covariance) * common, shape.covariance.dtype),
     )
 
 
@@ -82,7 +83,7 @@ def _told_apart(shape: Shape, up: np.ndarray) -> Shape:
         return shape
     count = len(shape.inliers)
     status = int(shape.status) & ~Status.LOW_MARGIN | (Status.LOW_MARGIN if shape.margin < NARROW else 0)
-    shape = dataclasses.replace(shape, status=np.asarray(status, np.int32))
+    shape = dataclasses.replace(shape, status=on_host(status, np.int32))
     if count < FEWEST_PIXELS:
         return refused(shape, Status.TOO_FEW_POINTS, "too few pixels for the errors that they share")
     if np.asarray(shape.inliers).mean() < HOLDS:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from jaxfuzzy.arrays import on_device, product
+from jaxfuzzy.arrays import on_device, on_host, product
 from jaxfuzzy.dividing import SMALLEST, Parted, Stepped, cut_in_two, left_over, with_left_over
 from jaxfuzzy.fitting import distances
 from jaxfuzzy.joining import parts_of_one_body
@@ -149,7 +149,7 @@ def _extended(points: np.ndarray, every: np.ndarray, own: np.ndarray, shape: Sha
     if shape.primitive is not None:
         inliers = distances(shape.primitive, points[every]) <= float(shape.noise_distance)
     inliers[np.isin(every, own)] = np.asarray(shape.inliers)
-    return dataclasses.replace(shape, inliers=inliers)
+    return dataclasses.replace(shape, inliers=on_host(inliers))
 
 
 def _rebuilt(

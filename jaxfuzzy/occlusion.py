@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfuzzy.arrays import lengths, nth_smallest, product
+from jaxfuzzy.arrays import lengths, nth_smallest, on_host, product
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Plane, Primitive
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -95,8 +95,8 @@ def with_hidden_ends(
             body = shape.primitive
             if isinstance(body, Box):
                 seen = np.array([i not in hidden for i in range(3)]) & np.asarray(body.seen)
-                body = dataclasses.replace(body, seen=seen)
-            status = np.asarray(int(shape.status) | Status.LOWER_BOUND, np.int32)
+                body = dataclasses.replace(body, seen=on_host(seen))
+            status = on_host(int(shape.status) | Status.LOWER_BOUND, np.int32)
             shape = dataclasses.replace(shape, primitive=body, status=status)
         told.append(shape)
     return tuple(told)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxfuzzy.arrays import lengths
+from jaxfuzzy.arrays import lengths, on_host
 from jaxfuzzy.bounds import stretch
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.shapes import Shape
@@ -70,4 +70,4 @@ def _level(on: np.ndarray, plane: Plane, up: np.ndarray, camera: np.ndarray | No
     axes = np.stack([level, np.cross(normal, level)]) / np.linalg.norm(level)
     corners = middle + np.array([[left, low], [right, low], [right, high], [left, high]]) @ axes
     dtype = plane.corners.dtype
-    return dataclasses.replace(plane, point=corners.mean(axis=0).astype(dtype), corners=corners.astype(dtype))
+    return dataclasses.replace(plane, point=on_host(corners.mean(axis=0), dtype), corners=on_host(corners, dtype))

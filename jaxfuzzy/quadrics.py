@@ -7,7 +7,7 @@ generalised eigenproblems A n = lambda B n of nine unknowns do; in plain NumPy, 
 
 import numpy as np
 
-from jaxfuzzy.arrays import product
+from jaxfuzzy.arrays import on_host, product
 from jaxfuzzy.objects import MOST, fair_order
 from jaxfuzzy.primitives import Quadric
 
@@ -59,7 +59,7 @@ def quadric_of(points: np.ndarray, weights: np.ndarray, noise_distance: float) -
     inliers = (distance <= 1) & real
     bounds = np.stack([points[inliers].min(axis=0), points[inliers].max(axis=0)])
     coefficients = _placed(np.append(normal, -mean @ normal), middle, unit)
-    return Quadric(coefficients, bounds), inliers
+    return Quadric(on_host(coefficients), on_host(bounds)), inliers
 
 
 def _terms(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

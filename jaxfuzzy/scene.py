@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,36 +11,28 @@ import jax
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, Float, Int, all_on_device, lengths, on_device, record, static
+from jaxfuzzy.arrays import Array, Float, Int, all_on_device, on_device, record, static
 from jaxfuzzy.cloud import Cloud
-from jaxfuzzy.evidence import FEWEST_PIXELS, in_independent_points, told_apart, worth
-from jaxfuzzy.flecks import in_flecks, pixels_a_point
+from jaxfuzzy.flecks import in_flecks
 from jaxfuzzy.ground import fit_ground, foreground
-from jaxfuzzy.groups import by_shapes, by_steps, members_of
-from jaxfuzzy.linalg import tangents
 from jaxfuzzy.looks import compiling_ahead
 from jaxfuzzy.matcher import Matcher, chosen
+from jaxfuzzy.naming import Seen, named
 from jaxfuzzy.objects import OF_SCENE, PIXELS_PER_POINT
-from jaxfuzzy.occlusion import with_hidden_ends
-from jaxfuzzy.outline import sight_of, without_seen_through
-from jaxfuzzy.patches import level_patches
 from jaxfuzzy.photos import read_pair, rectify
-from jaxfuzzy.pieces import without_pieces
 from jaxfuzzy.primitives import Plane
 from jaxfuzzy.reproject import cloud_from_disparity
 from jaxfuzzy.rig import Rig
-from jaxfuzzy.rivals import chosen_by_outline
-from jaxfuzzy.segment import Segmentation, segment
-from jaxfuzzy.shapes import Fits, Shape, with_quadrics
-from jaxfuzzy.steps import between_steps
+from jaxfuzzy.segment import Segmentation, candidates_of, segment
+from jaxfuzzy.shapes import Shape, distance_of, kinds_of
 from jaxfuzzy.stereo import reconstruct
-from jaxfuzzy.trials import FEWEST
-from jaxfuzzy.vertical import agreed_vertical, upright_again, witness_of
 
 # Noise distance in standard deviations of a point along its viewing ray: farther points rather belong to noise.
 NOISE_SIGMAS = 2.5
 # The camera's own idea of the vertical, until a supporting plane tells better (OpenCV's y points down).
 CAMERA_UP = (0.0, -1.0, 0.0)
+# Where points were seen from, unless something else is said.
+EYE = (0.0, 0.0, 0.0)
 # How far in radians a supporting plane may lean from a vertical that was given.
 KNOWN_TILT = 0.15
 FEWEST_POINTS = 50
@@ -142,7 +134,7 @@ def model_scene(
         ValueError: An image or an option cannot be used, or sizes disagree.
         DataError: Fewer than 50 pixels were matched, or fewer than 50 points stand above the ground.
     """
-    _check_options(options)
+    options = _checked(options)
     clock = _Clock(progress)
     with clock.stage("matching"):
         image, image_right = read_pair(left, right, rig)
@@ -178,16 +170,17 @@ def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: An
         TypeError: An unknown option.
         DataError: Fewer than 50 points stand above the ground.
     """
-    _check_options(options)
-    return _model(cloud, _Clock(progress), **options)
+    return _model(cloud, _Clock(progress), **_checked(options))
 
 
-def _check_options(options: dict[str, Any]) -> None:
+def _checked(options: dict[str, Any]) -> dict[str, Any]:
+    """The options, all checked before the work begins that can be without knowing the points."""
     known = ("up", "ground", "camera", "rule", "noise_distance", "weights", *SEGMENT_OPTIONS, *SHAPE_OPTIONS)
     for name in options:
         if name not in known:
             raise TypeError(f"unknown option {name!r}: allowed are {', '.join(known)}")
-    checks.choice(options.get("rule", "robust"), "rule", RULES)
+    rule, camera = options.get("rule", "robust"), options.get("camera", EYE)
+    checks.choice(rule, "rule", RULES)
     ground, up = options.get("ground", "auto"), options.get("up", "auto")
     if ground is not None:
         checks.choice(ground, "ground", ("auto",))
@@ -197,6 +190,16 @@ def _check_options(options: dict[str, Any]) -> None:
         checks.choice(up, "up", ("auto",))
     else:
         checks.direction(up, "up")
+    division, naming = RULES[rule]
+    distance_of(options.get("distance"), naming, camera)
+    if np.ndim(options.get("noise_distance", "auto")) == 0:
+        checks.noise_distance_or_auto(options.get("noise_distance", "auto"))
+    several: dict[str, Any] = {}
+    if "kinds" in options:
+        several["kinds"] = kinds_of(options["kinds"])
+    if options.get("ks", "auto") != "auto":
+        several["ks"] = candidates_of(options["ks"], division)
+    return options | several
 
 
 def _model(
@@ -205,7 +208,7 @@ def _model(
     *,
     up: Any = "auto",
     ground: str | None = "auto",
-    camera: Any = (0.0, 0.0, 0.0),
+    camera: Any = EYE,
     rule: str = "robust",
     noise_distance: Any = "auto",
     weights: Any = None,
@@ -215,141 +218,97 @@ def _model(
     # Picked from on the host: each number of points picked in JAX would compile and keep a program of its own.
     points = np.asarray(checks.places(cloud.points, "cloud.points"))
     count = points.shape[0]
-    vertical = CAMERA_UP if isinstance(up, str) else checks.direction(up, "up")
-    known_up = {} if isinstance(up, str) else {"max_tilt": KNOWN_TILT}
     heaviness = checks.weights(weights, count)
     checks.noise_distance_or_auto(noise_distance, count)
     if cloud.pixels_px is not None and cloud.pixels_px.shape != (count, 2):
         raise ValueError(f"cloud.pixels_px must have shape ({count}, 2), got {cloud.pixels_px.shape}")
-    deviation, plane, status = cloud.depth_std, None, int(cloud.status)
-    thickness, flat, found = 0.0, np.zeros(count, bool), None
-    kept = np.ones(count, bool) if heaviness is None else np.asarray(heaviness) > 0
-    # Of pixels, of which neighbours err alike, so many tell as much as one independent point.
-    smallest = 1 if cloud.pixels_px is None or rule == "paper" else PIXELS_PER_POINT
+    division, naming = RULES[rule]
+    seen = Seen(
+        points=points,
+        pixels=None if cloud.pixels_px is None or rule == "paper" else np.asarray(cloud.pixels_px),
+        noise_distance=noise_distance,
+        weights=None if heaviness is None else np.asarray(heaviness),
+        camera=None if camera is None else np.asarray(camera),
+        up=np.asarray(CAMERA_UP) if isinstance(up, str) else checks.direction(up, "up"),
+        up_given=not isinstance(up, str),
+        ground=None,
+        flat=np.zeros(count, bool),
+        thickness=0.0,
+    )
     along_ray = camera is not None and options.get("distance", "ray") == "ray"
     with compiling_ahead(OF_SCENE, points.dtype, along_ray):
         with clock.stage("ground"):
-            if ground is not None:
-                found = fit_ground(
-                    points, up=vertical, weights=heaviness, depth_std=cloud.depth_std, camera=camera, **known_up
-                )
-                standing = foreground(points, found, up=vertical, weights=heaviness, camera=camera)
-                kept &= np.asarray(standing.mask)
-                thickness, flat = float(standing.cut), np.asarray(standing.ground)
-                plane, deviation, status = found.plane, found.depth_std, status | int(found.status)
-                vertical = vertical if plane is None else np.asarray(plane.normal)
-                if smallest > 1:
-                    kept &= ~in_flecks(np.asarray(cloud.pixels_px), kept, smallest)
-        if isinstance(noise_distance, str) and deviation is not None:
-            noise_distance = NOISE_SIGMAS * np.asarray(deviation)
-        segment_rule, shape_rule = RULES[rule]
-        own = np.flatnonzero(kept)
-
-        def seen(of: np.ndarray) -> dict[str, Any]:
-            """What both stages take beside the points."""
-            noise = noise_distance if np.ndim(noise_distance) == 0 else np.asarray(noise_distance)[of]
-            own_weights = None if heaviness is None else np.asarray(heaviness)[of]
-            return {"up": vertical, "camera": camera, "noise_distance": noise, "weights": own_weights}
-
+            seen, kept = _above_ground(seen, cloud.depth_std, look=ground is not None)
         with clock.stage("objects"):
-            if len(own) < FEWEST_POINTS:
-                raise checks.DataError(
-                    f"only {len(own)} of {count} points stand above the ground, {FEWEST_POINTS} are needed"
-                )
-            picked = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
-            parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
-            for _ in range(MOST_SWEPT):
-                kept_of = _standing(points[own], np.asarray(parts.labels), plane, smallest)
-                if kept_of.all() or kept_of.sum() < FEWEST_POINTS:
-                    break
-                own = own[kept_of]
-                parts = segment(points[own], rule=segment_rule, **seen(own), **picked)
+            how = {name: options[name] for name in SEGMENT_OPTIONS if name in options}
+            own, parts = _divided(seen, np.flatnonzero(kept), rule=division, **how)
     with clock.stage("shapes"):
-        picked = {name: options[name] for name in SHAPE_OPTIONS if name in options}
-        places, eye = points[own], None if camera is None else np.asarray(camera)
-        members = members_of(parts)
-        sight = None
-        if eye is not None and shape_rule != "paper":
-            loose = np.ones(count, bool)
-            loose[own[np.concatenate([np.zeros(0, int), *members])]] = False
-            sight = sight_of(points, loose, eye, np.asarray(vertical, float))
-
-        correlated = cloud.pixels_px is not None and shape_rule != "paper"
-        how = picked | {"rule": shape_rule, "capacity": OF_SCENE, "correlated": correlated}
-        fits = Fits(places, **seen(own) | how)
-
-        def fit(
-            sets: Sequence[np.ndarray],
-            wholes: Sequence[np.ndarray] | None = None,
-            further: Sequence[bool] | None = None,
-        ) -> tuple[Shape, ...]:
-            found = fits.shapes(sets, further=further)
-            if sight is None:
-                return found
-            of = None if wholes is None else [own[m] for m in wholes]
-            return without_seen_through(points, [own[m] for m in sets], found, sight, of)
-
-        def parted(of: np.ndarray) -> np.ndarray:
-            return np.asarray(segment(places[of], **seen(own[of])).labels)
-
-        def stepped(of: np.ndarray, noise: float) -> list[np.ndarray]:
-            pixels = np.asarray(cloud.pixels_px)[own[of]]
-            return [of[i] for i in between_steps(pixels, lengths(places[of] - eye), noise, spacing)]
-
-        def as_kinds(of: Sequence[int], kinds: Sequence[str]) -> tuple[Shape, ...]:
-            return in_independent_points(fits.shapes_as([members[i] for i in of], kinds), OF_SCENE)
-
-        def stood(of: Sequence[int], lean: float) -> tuple[Shape, ...]:
-            # The prior is weighed against all points that a fit counts, of which few are independent.
-            leans = [lean / np.sqrt(worth(len(members[i]), OF_SCENE) if correlated else 1.0) for i in of]
-            sets, kinds = [members[i] for i in of], [shapes[i].kind for i in of]
-            found = fits.shapes_about(sets, kinds, np.asarray(vertical, float), leans)
-            return in_independent_points(found, OF_SCENE) if correlated else found
-
-        least = FEWEST_PIXELS if correlated else FEWEST
-        spacing = pixels_a_point(np.asarray(cloud.pixels_px)) if correlated else np.inf
-        shapes = fit(members)
-        if segment_rule == "robust" and "ks" not in options:
-            across = np.asarray(tangents(vertical))
-            parts, shapes = by_shapes(places, across, parts, shapes, fit, parted, eye, least)
-            if correlated and eye is not None:
-                parts, shapes = by_steps(places, parts, shapes, fit, stepped, least)
-            members = members_of(parts)
-        if correlated:
-            shapes = in_independent_points(shapes, OF_SCENE)
-        if sight is not None:
-            mine = [own[m] for m in members]
-            if correlated:
-                shapes = chosen_by_outline(points, mine, shapes, sight, as_kinds)
-            shapes = without_seen_through(points, mine, shapes, sight)
-            if correlated:
-                depth = lengths(points - eye)
-                shapes = without_pieces(np.asarray(cloud.pixels_px), depth, flat, mine, shapes)
-        if shape_rule != "paper":
-            given = not isinstance(up, str)
-            axis = np.asarray(vertical, float)
-            witness = witness_of(points, found, axis, given=given, camera=eye, correlated=correlated)
-            agreed = agreed_vertical(shapes, witness)
-            if agreed is not None:
-                vertical = agreed.up
-                shapes = upright_again(shapes, agreed, stood)
-            shapes = level_patches(places, members, shapes, np.asarray(vertical, float), eye)
-        shapes = with_quadrics(places, members, shapes, seen(own)["weights"])
-        if eye is not None:
-            shapes = with_hidden_ends(places, members, shapes, eye, plane, thickness)
-        if correlated:
-            shapes = told_apart(shapes, np.asarray(vertical, float))
-    settings = {"up": up, "ground": ground, "camera": camera, "rule": rule, "noise_distance": _told(noise_distance)}
+        how = {name: options[name] for name in SHAPE_OPTIONS if name in options}
+        regroup = division == "robust" and "ks" not in options
+        parts, shapes, vertical = named(seen, own, parts, naming, regroup, **how)
+    settings = {
+        "up": up,
+        "ground": ground,
+        "camera": camera,
+        "rule": rule,
+        "noise_distance": _told(seen.noise_distance),
+    }
+    status = int(cloud.status) | int(parts.status) | (0 if seen.ground is None else int(seen.ground.status))
     return Scene(
         cloud=cloud,
         up=on_device(vertical, points.dtype),
-        ground=plane,
+        ground=None if seen.ground is None else seen.ground.plane,
         segmentation=_of_all(parts, own, count),
         shapes=all_on_device(shapes),
         timings=clock.seconds,
         settings={name: _plain(value) for name, value in (settings | options).items()},
-        status=on_device(status | int(parts.status), np.int32),
+        status=on_device(status, np.int32),
     )
+
+
+def _above_ground(seen: Seen, depth_std: Any, *, look: bool) -> tuple[Seen, np.ndarray]:
+    """What the supporting plane tells: the vertical, the noise, and which points (N,) stand on it.
+
+    Args:
+        seen: The cloud.
+        depth_std: Standard deviation of each point along its ray (N,); None where not known.
+        look: Whether there is such a plane to look for.
+    """
+    kept = np.ones(len(seen.points), bool) if seen.weights is None else seen.weights > 0
+    if look:
+        known_up = {"max_tilt": KNOWN_TILT} if seen.up_given else {}
+        which: dict[str, Any] = {"up": seen.up, "weights": seen.weights, "camera": seen.camera}
+        found = fit_ground(seen.points, depth_std=depth_std, **which, **known_up)
+        standing = foreground(seen.points, found, **which)
+        kept &= np.asarray(standing.mask)
+        depth_std = found.depth_std
+        seen = seen._replace(ground=found, flat=np.asarray(standing.ground), thickness=float(standing.cut))
+        if found.plane is not None:
+            seen = seen._replace(up=np.asarray(found.plane.normal))
+    if isinstance(seen.noise_distance, str) and depth_std is not None:
+        seen = seen._replace(noise_distance=NOISE_SIGMAS * np.asarray(depth_std))
+    if seen.pixels is not None:
+        kept &= ~in_flecks(seen.pixels, kept, PIXELS_PER_POINT)
+    return seen, kept
+
+
+def _divided(seen: Seen, own: np.ndarray, **how: Any) -> tuple[np.ndarray, Segmentation]:
+    """The points that stand above the ground, by their indices, and their division; without groups that are none."""
+    # Of pixels, of which neighbours err alike, so many tell as much as one independent point.
+    smallest = 1 if seen.pixels is None else PIXELS_PER_POINT
+    if len(own) < FEWEST_POINTS:
+        raise checks.DataError(
+            f"only {len(own)} of {len(seen.points)} points stand above the ground, {FEWEST_POINTS} are needed"
+        )
+    parts = segment(seen.points[own], **seen.of(own), **how)
+    plane = None if seen.ground is None else seen.ground.plane
+    for _ in range(MOST_SWEPT):
+        kept = _standing(seen.points[own], np.asarray(parts.labels), plane, smallest)
+        if kept.all() or kept.sum() < FEWEST_POINTS:
+            break
+        own = own[kept]
+        parts = segment(seen.points[own], **seen.of(own), **how)
+    return own, parts
 
 
 def load_scene(folder: str | Path) -> Scene:

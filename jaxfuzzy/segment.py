@@ -95,7 +95,7 @@ def segment(
     count = cloud.shape[0]
     given = checks.weights(weights, count)
     checks.choice(rule, "rule", ("robust", "paper"))
-    candidates = _candidates(ks, rule, count)
+    candidates = candidates_of(ks, rule, count)
     axes = np.asarray(tangents(checks.direction(up, "up")))
     noise = _noise(noise_distance, count)
     if camera is not None:
@@ -273,11 +273,12 @@ def _shares(labels: np.ndarray, w: np.ndarray, k: int, dtype: Any) -> Array:
     return on_device(mass / max(mass.sum(), np.finfo(dtype).tiny), dtype)
 
 
-def _candidates(ks: Any, rule: str, count: int) -> tuple[int, ...]:
+def candidates_of(ks: Any, rule: str, count: int | None = None) -> tuple[int, ...]:
+    """The numbers of objects allowed, in order, of so many points; any where that is not known yet."""
     if isinstance(ks, str):
         checks.choice(ks, "ks", ("auto",))
         low, high = (2, 5) if rule == "paper" else (1, MOST)
-        return tuple(range(low, min(high, count) + 1)) or (low,)
+        return tuple(range(low, min(high, count or high) + 1)) or (low,)
     if not isinstance(ks, Iterable):
         raise TypeError(f"ks must be 'auto' or several numbers such as (3,), got {ks!r}")
     wanted = [checks.integer(k, "ks", at_least=1, at_most=count, why=" (the number of points)") for k in ks]

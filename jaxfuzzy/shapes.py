@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxfuzzy import checks
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, all_on_device, record, static
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, Scalar, all_on_device, on_host, record, static
 from jaxfuzzy.assembly import Bounded, bounded
 from jaxfuzzy.fitting import TOLERANCES, Fitted
 from jaxfuzzy.looks import Look, Settings, first_look, further_look, look_about, look_as, side_by_side, unfit
@@ -167,6 +167,27 @@ def fit_shapes(
     return all_on_device(with_quadrics(np.asarray(array), members, shapes, weights))
 
 
+def kinds_of(kinds: Any) -> tuple[str, ...]:
+    """The kinds to choose from."""
+    if isinstance(kinds, str):
+        raise TypeError(f"kinds must be several names, got the string {kinds!r}")
+    if not kinds:
+        raise ValueError(f"kinds must name one of {', '.join(map(repr, KINDS))} at least, got none")
+    return tuple(checks.choice(k, "kinds", KINDS) for k in kinds)
+
+
+def distance_of(distance: Any, rule: str, camera: Any) -> str:
+    """How far a point lies from a surface: what was asked for, or what is usual."""
+    if camera is not None:
+        checks.position(camera, "camera")
+    usual = "algebraic" if rule == "paper" else "geometric" if camera is None else "ray"
+    able = ("geometric", "algebraic") if rule == "paper" else ("ray", "geometric")
+    found: str = checks.choice(distance or usual, f"distance with rule={rule!r}", able)
+    if found == "ray" and camera is None:
+        raise ValueError("camera must be given with distance='ray', got None")
+    return found
+
+
 class Fits:
     """Shapes of sets of points of one cloud, which may overlap; none of them is searched twice.
 
@@ -194,17 +215,14 @@ class Fits:
     ) -> None:
         self.points = checks.places(points)
         count = len(self.points)
-        self.delta = _noise(noise_distance, count)
-        kinds = _kinds(kinds)
+        given = checks.noise_distance_or_auto(noise_distance, count)
+        # Of each point; None where it is not given.
+        self.delta = None if given is None else np.broadcast_to(np.asarray(given, float), count)
+        kinds = kinds_of(kinds)
         self.up = checks.direction(up, "up")
-        one = None if camera is None else checks.points(np.reshape(camera, (1, -1)), "camera", dims=3)
-        eye = None if one is None else np.asarray(one, float)[0]
         self.rule = checks.choice(rule, "rule", ("likelihood", "gric", "paper"))
-        usual = "algebraic" if rule == "paper" else "geometric" if eye is None else "ray"
-        able = ("geometric", "algebraic") if rule == "paper" else ("ray", "geometric")
-        self.distance = checks.choice(distance or usual, f"distance with rule={rule!r}", able)
-        if self.distance == "ray" and eye is None:
-            raise ValueError("camera must be given with distance='ray', got None")
+        self.distance = distance_of(distance, rule, camera)
+        eye = None if camera is None else checks.position(camera, "camera")
         weight = checks.weights(weights, count)
         self.weight = np.ones(count) if weight is None else np.asarray(weight, float)
         along_ray = self.distance == "ray" or (rule == "paper" and eye is not None)
@@ -320,7 +338,7 @@ def with_quadrics(
             found = quadric_of(np.asarray(points[own], float), weight[own], float(shape.noise_distance))
         if found is not None:
             quadric = jax.tree.map(lambda a: a.astype(points.dtype), found[0])
-            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=found[1])
+            shape = dataclasses.replace(shape, kind="quadric", primitive=quadric, inliers=on_host(found[1]))
         told.append(shape)
     return tuple(told)
 
@@ -345,34 +363,16 @@ def _by_most_points(
         status |= Status.MAY_BE_BOX
     return Shape(
         primitive=found.primitive,
-        inliers=np.asarray(found.inliers),
-        noise_distance=np.asarray(np.median(delta), settings.dtype),
+        inliers=on_host(found.inliers),
+        noise_distance=on_host(np.median(delta), settings.dtype),
         scores=scores,
         margin=margin,
         counts=found.counts,
-        covariance=np.zeros((0, 0), settings.dtype),
-        status=np.asarray(status, np.int32),
+        covariance=on_host(np.zeros((0, 0)), settings.dtype),
+        status=on_host(status, np.int32),
         kind=found.kind,
         guards=guards,
     )
-
-
-def _noise(value: Any, count: int) -> np.ndarray | None:
-    """Noise distance of each point (N,); None for "auto"."""
-    if isinstance(value, str):
-        checks.choice(value, "noise_distance", ("auto",))
-        return None
-    if value is None:
-        raise TypeError("noise_distance must be 'auto', a number, or an array (N,), got None")
-    return np.broadcast_to(np.asarray(checks.noise_distance(value, count), float), count)
-
-
-def _kinds(kinds: Sequence[str]) -> tuple[str, ...]:
-    if isinstance(kinds, str):
-        raise TypeError(f"kinds must be several names, got the string {kinds!r}")
-    if not kinds:
-        raise ValueError(f"kinds must name one of {', '.join(map(repr, KINDS))} at least, got none")
-    return tuple(checks.choice(k, "kinds", KINDS) for k in kinds)
 
 
 def _shapes(looks: dict[int, Look], poor: list[Status], sizes: list[int], settings: Settings) -> tuple[Shape, ...]:

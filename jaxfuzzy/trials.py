@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from jaxfuzzy.arrays import lengths
+from jaxfuzzy.arrays import lengths, on_host
 from jaxfuzzy.primitives import Box, Cone, Cylinder, Primitive, Sphere
 from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
@@ -72,9 +72,9 @@ def refused(shape: Shape, status: Status, why: str) -> Shape:
         shape,
         kind="unknown",
         primitive=None,
-        inliers=np.zeros(len(shape.inliers), bool),
-        covariance=np.zeros((0, 0), shape.covariance.dtype),
-        status=np.asarray(Status.REFUSED | status, np.int32),
+        inliers=on_host(np.zeros(len(shape.inliers), bool)),
+        covariance=on_host(np.zeros((0, 0)), shape.covariance.dtype),
+        status=on_host(Status.REFUSED | status, np.int32),
         guards=(*shape.guards, f"{shape.kind}: {why}"),
     )
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxfuzzy.arrays import on_host
 from jaxfuzzy.ground import Ground
 from jaxfuzzy.linalg import tangents
 from jaxfuzzy.objects import PIXELS_PER_POINT
@@ -163,7 +164,7 @@ def upright_again(
                 primitive=found.primitive,
                 inliers=found.inliers,
                 covariance=found.covariance,
-                status=np.asarray(status, np.int32),
+                status=on_host(status, np.int32),
             )
     return tuple(new)
 

@@ -17,7 +17,7 @@ ORDER = """
     quadrics
     shapes trials joining dividing groups
     cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate brightness stereo render
-    flecks steps outline pieces occlusion evidence rivals vertical patches scene
+    flecks steps outline pieces occlusion evidence rivals vertical patches naming scene
     losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal
     cli __main__ __init__

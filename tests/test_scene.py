@@ -135,7 +135,7 @@ def test_progress_is_told_in_order(paper_pair):
         ({"colour": 1}, TypeError, "colour"),
         ({"noise_distance": -1.0}, ValueError, "noise_distance"),
         ({"noise_distance": "foo"}, ValueError, "noise_distance must be one of 'auto', got 'foo'"),
-        ({"noise_distance": None}, ValueError, "noise_distance must be 'auto' or above 0"),
+        ({"noise_distance": None}, TypeError, "noise_distance must be 'auto' or above 0"),
         (
             {"noise_distance": np.ones(199)},
             ValueError,

@@ -354,7 +354,7 @@ def test_degenerate_points(points):
         ({"up": (0, 0, 0)}, ValueError, "up must be finite and not of length zero"),
         ({"rule": "best"}, ValueError, "rule must be one of 'robust', 'paper'"),
         ({"noise_distance": 0.0}, ValueError, "noise_distance must be finite and above 0"),
-        ({"noise_distance": None}, ValueError, "noise_distance must be 'auto' or above 0, got None"),
+        ({"noise_distance": None}, TypeError, "noise_distance must be 'auto' or above 0, got None"),
         ({"weights": -np.ones(200)}, ValueError, "weights must not be negative"),
         ({"camera": (0, 0)}, ValueError, r"camera must have shape \(3,\)"),
     ],
