@@ -1,7 +1,8 @@
 """The words of the command line: what each command takes, and its help."""
 
 import argparse
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -11,6 +12,8 @@ Command = Callable[[argparse.Namespace], int]
 WRONG_USE = 2
 KINDS = ("plane", "box", "cylinder", "cone", "sphere")
 MOST_KS = 1000
+# Options that take numbers of which the first may be negative.
+PLACES = ("--up", "--camera")
 
 EXAMPLES = """examples:
   jaxfuzzy demo                                    the bundled photograph; open out/report.html
@@ -19,7 +22,8 @@ EXAMPLES = """examples:
   jaxfuzzy cluster points.csv -k 2:5 --sizes
   jaxfuzzy COMMAND --help                          more on each
 
-exit status: 0 done, 1 the data could not be modelled, 2 wrong use or unreadable input, 130 stopped"""
+exit status: 0 done, 1 the data could not be modelled, 2 wrong use or unreadable input, 130 stopped
+JAXFUZZY_TRACEBACK=1 in the environment shows where an error came from"""
 
 WRITTEN = """writes into DIR, all or nothing:
   report.html, figures/   for people (need the view extra)
@@ -83,6 +87,17 @@ def parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     command("cluster", "cluster any table of points by fuzzy c-means", CLUSTER, _cluster)
     command("calibrate", "calibrate two cameras from photographs of a chessboard", CALIBRATE, _calibrate)
     return top
+
+
+def joined(words: Sequence[str]) -> list[str]:
+    """Words with `--up -1,0,0` as one, `--up=-1,0,0`: what begins with a dash is an option to argparse."""
+    found: list[str] = []
+    for word in words:
+        if found and found[-1] in PLACES and re.match(r"-[\d.]", word):
+            found[-1] += "=" + word
+        else:
+            found.append(word)
+    return found
 
 
 def _scene(command: argparse.ArgumentParser) -> None:

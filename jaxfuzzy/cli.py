@@ -10,12 +10,14 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxfuzzy.arguments import WRONG_USE, parser
+from jaxfuzzy import checks
+from jaxfuzzy.arguments import WRONG_USE, joined, parser
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.terminal import Progress, columns, say, show, warnings_as_lines
 
@@ -40,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = parser(
             {"demo": _demo, "model": _model, "shapes": _shapes, "cluster": _cluster, "calibrate": _calibrate}
-        ).parse_args(argv)
+        ).parse_args(joined(sys.argv[1:] if argv is None else argv))
     except SystemExit as done:  # argparse has said why
         return int(done.code or 0)
     try:
@@ -56,12 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Whoever read our output has gone; Python would complain once more when it closes it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except DataError as error:
-        say(str(error))
-        return NOT_MODELLED
     except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+        if os.environ.get("JAXFUZZY_TRACEBACK"):
+            traceback.print_exc()
         say(str(error))
-        return WRONG_USE
+        return NOT_MODELLED if isinstance(error, DataError) else WRONG_USE
     except MemoryError:
         say("not enough memory for an input of this size")
         return WRONG_USE
@@ -137,8 +138,10 @@ def _cluster(args: argparse.Namespace) -> int:
     from jaxfuzzy.fcm import fcm
     from jaxfuzzy.seeding import histogram_seeds
     from jaxfuzzy.status import describe
-    from jaxfuzzy.validity import choose_k
+    from jaxfuzzy.validity import INDICES, RULES, choose_k
 
+    checks.choice(args.index, "index", INDICES)
+    checks.choice(args.rule, "rule", RULES)
     if args.out is not None:
         table.check_suffix(args.out)
         _check_file(args.out, args.points)
@@ -146,22 +149,23 @@ def _cluster(args: argparse.Namespace) -> int:
     ks = args.ks
     with Progress(args.quiet) as progress:
         scores: dict[int, float] = {}
-        k = ks[0]
         if len(ks) > 1:
             progress("trying every k", 0.0)
             chosen = choose_k(
                 points, ks, m=args.m, index=args.index, rule=args.rule, noise_distance=args.noise_distance
             )
-            k = int(chosen.k)
+            k, partition = int(chosen.k), chosen.partition
             scores = {int(one): float(score) for one, score in zip(chosen.ks, chosen.scores, strict=True)}
-        progress("fitting", 0.5 if scores else 0.0)
-        partition = fcm(points, histogram_seeds(points, k).centers, m=args.m, noise_distance=args.noise_distance)
+        else:
+            progress("fitting", 0.0)
+            k = ks[0]
+            partition = fcm(points, histogram_seeds(points, k).centers, m=args.m, noise_distance=args.noise_distance)
         if args.sizes:  # from a fit without sizes: started from the seeds alone, sizes follow a poor seed
             partition = fcm(points, partition.centers, m=args.m, noise_distance=args.noise_distance, sizes=True)
         if args.out is not None:
             progress("writing", 0.9)
             table.write_points(args.out, names, points, partition)
-    result = _cluster_result(names, k, args.index, scores, partition)
+    result = _cluster_result(names, k, args.index if scores else None, scores, partition)
     if args.json:
         show(json.dumps(result, allow_nan=False))
         return DONE
@@ -183,7 +187,7 @@ def _cluster(args: argparse.Namespace) -> int:
 
 
 def _cluster_result(
-    names: Sequence[str], k: int, index: str, scores: dict[int, float], partition: "Partition"
+    names: Sequence[str], k: int, index: str | None, scores: dict[int, float], partition: "Partition"
 ) -> dict[str, Any]:
     import numpy as np
 

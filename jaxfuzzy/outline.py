@@ -92,12 +92,20 @@ def without_seen_through(
     """
     told = []
     for own, shape, whole in zip(members, shapes, wholes or members, strict=True):
-        if inside(shape.primitive, sight.camera[None], 0.0).any():
+        if _holds(shape.primitive, sight.camera):
             shape = refused(shape, Status.SEEN_THROUGH, "the camera would stand within it")
         elif seen_through(points, own, shape, sight, whole).share > THROUGH:
             shape = refused(shape, Status.SEEN_THROUGH, "what stands behind is seen where it would hide it")
         told.append(shape)
     return tuple(told)
+
+
+def _holds(body: Primitive | None, place: np.ndarray) -> bool:
+    """Whether a place (3,) lies within a body."""
+    if isinstance(body, Box):
+        local = np.asarray(body.axes, float) @ (place - np.asarray(body.center, float))
+        return bool((np.abs(local) < np.asarray(body.size) / 2).all())
+    return bool(inside(body, place[None], 0.0).any())
 
 
 class Through(NamedTuple):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks, meshes
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, as_float, record
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, as_float, on_host, record
 from jaxfuzzy.linalg import divide, norm, normalised, tangents
 
 Vertices = Float[Array, "V 3"]
@@ -94,7 +94,7 @@ class Box(_Body):
     center: Float[Array, "3"]
     size: Float[Array, "3"]
     axes: Float[Array, "3 3"]
-    seen: Bool[Array, "3"]
+    seen: Bool[Array, "3"] = dataclasses.field(default_factory=lambda: on_host(np.ones(3, bool)))
 
     kind: ClassVar[str] = "box"
     parameter_names: ClassVar[tuple[str, ...]] = (

@@ -25,6 +25,8 @@ DISPARITY_STD_PX, MEASURED_ROWS = 0.2, 560
 TO_STD = 1.4826
 # Disparities above the width of a picture, or above this, are told.
 NARROWEST_PX = 64
+# A plane is fitted with weights that follow from it, so many times.
+MOST_SWEEPS = 30
 
 
 def usual_std_px(rows: int) -> float:
@@ -138,19 +140,22 @@ def measure_noise(disparity_px: Any, mask: Any, *, truth_px: Any = None, block: 
         block: Side of the blocks, pixels; it must be large against the reach of the correlation.
 
     Raises:
+        ValueError: Shapes disagree, or `block` is less than 2.
         DataError: Fewer than 100 pixels, or fewer than 4 blocks of which half is seen.
     """
+    checks.integer(block, "block", at_least=2)
     values = np.asarray(disparity_px, float)
-    mask = _mask(mask, values.shape) & np.isfinite(values)
+    mask = _mask(mask, values.shape, "mask") & np.isfinite(values)
+    if truth_px is not None and np.shape(truth_px) != values.shape:
+        raise ValueError(f"truth_px must have the shape of disparity_px, {values.shape}, got {np.shape(truth_px)}")
     if mask.sum() < 100:
         raise DataError(f"mask must hold at least 100 pixels with a disparity, got {int(mask.sum())}")
     rows, columns = np.nonzero(mask)
     if truth_px is None:
         design = np.column_stack([columns - columns.mean(), rows - rows.mean(), np.ones(len(rows))])
         weight = np.ones(len(rows))
-        for _ in range(
-            30
-        ):  # Geman and McClure's weights, their scale from the median: a third of wrong pixels is no harm
+        # Geman and McClure's weights, their scale from the median: a third of wrong pixels is no harm.
+        for _ in range(MOST_SWEEPS):
             root = np.sqrt(weight)[:, None]
             plane = np.linalg.lstsq(design * root, values[mask] * root[:, 0], rcond=None)[0]
             error = values[mask] - design @ plane
@@ -168,8 +173,8 @@ def measure_noise(disparity_px: Any, mask: Any, *, truth_px: Any = None, block: 
     if full.sum() < 4:
         raise DataError(f"mask must cover at least half of 4 blocks of {block} pixels, got {int(full.sum())}")
     means = sums[full] / held[full]
-    spread = np.sum(held[full] * means**2) / full.sum()
-    return Noise(std, max(1.0, float(spread / np.mean(error[good] ** 2))))
+    spread, of_one = np.sum(held[full] * means**2) / full.sum(), np.mean(error[good] ** 2)
+    return Noise(std, max(1.0, float(spread / of_one)) if of_one > 0 else 1.0)
 
 
 def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.ndarray) -> Cloud:
@@ -214,15 +219,15 @@ def _map(value: np.ndarray, name: str, rig: Rig) -> np.ndarray:
     return value.astype(np.float64 if value.dtype == np.float64 else np.float32)
 
 
-def _mask(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _mask(value: Any, shape: tuple[int, ...], name: str = "valid") -> np.ndarray:
     mask = np.asarray(value)
     if mask.shape != shape or mask.dtype not in (np.bool_, np.uint8):
-        raise ValueError(f"valid must be booleans of shape {shape}, got {mask.dtype} {mask.shape}")
+        raise ValueError(f"{name} must be booleans of shape {shape}, got {mask.dtype} {mask.shape}")
     return mask.astype(bool)
 
 
 def _std(value: Any, like: np.ndarray, valid: np.ndarray, name: str = "disparity_std_px") -> np.ndarray:
-    std = np.asarray(value, like.dtype)
+    std = np.asarray(checks.real(value, name), like.dtype)
     if std.shape == ():
         checks.number(value, name, above=0.0)
     elif std.shape != like.shape:

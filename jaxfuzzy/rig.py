@@ -82,6 +82,7 @@ class Rig:
                 _set(self, name, _vector(getattr(self, name), name, 2, positive=positive))
         if not isinstance(self.metric, bool | np.bool_):
             raise ValueError(f"metric must be True or False, got {self.metric!r}")
+        _set(self, "metric", bool(self.metric))
         self._check_pose()
 
     def _check_pose(self) -> None:
@@ -132,13 +133,15 @@ class Rig:
             to: A factor for both directions, or the new (width, height).
 
         Raises:
-            ValueError: The factor is not above 0, or a size is given to a rig that does not know its own.
+            ValueError: The factor is not above 0, a size is not of whole pixels, or the rig does not know its own.
         """
-        if isinstance(to, int | float):
+        if np.ndim(to) == 0:
             sx = sy = _vector([to], "to", 1, positive=True)[0]
             size = None if self.image_size is None else (round(self.image_size[0] * sx), round(self.image_size[1] * sy))
         else:
             width, height = _vector(to, "to", 2, positive=True)
+            if width % 1 or height % 1:
+                raise ValueError(f"to must be a factor or whole numbers (width, height), got {to!r}")
             size = (int(width), int(height))
             if self.image_size is None:
                 raise ValueError("to must be a factor, since this rig does not know its image_size")
@@ -318,9 +321,10 @@ def _vector(value: Any, name: str, count: int, *, positive: bool = False) -> tup
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be {count} numbers, got {value!r}") from None
+        array = np.zeros(0)
     if array.shape != (count,):
-        raise ValueError(f"{name} must be {count} number{'s' * (count > 1)}, got {value!r}")
+        shown = value[0] if count == 1 else value
+        raise ValueError(f"{name} must be {'one number' if count == 1 else f'{count} numbers'}, got {shown!r}")
     if not np.all(np.isfinite(array)) or (positive and not np.all(array > 0)):
         raise ValueError(f"{name} must be finite{' and above 0' * positive}, got {value!r}")
     return tuple(array.tolist())

@@ -35,9 +35,15 @@ def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rect
     Raises:
         ValueError: The text is in no known format, or what is there contradicts itself.
     """
-    if re.search(r"^[ \t]*cam0[ \t]*=", text, re.MULTILINE):
+    of_kitti = re.search(r"^P(0|2|_rect_00|_rect_02):\s+[-+.\d]", text, re.MULTILINE) is not None
+    of_middlebury = re.search(r"^[ \t]*cam0[ \t]*=", text, re.MULTILINE) is not None
+    if other is not None and (of_middlebury or of_kitti):
+        raise ValueError(f"is a calib.txt of {'Middlebury' if of_middlebury else 'KITTI'}, which needs no second file")
+    if cameras is not None and (of_middlebury or not of_kitti):
+        raise ValueError("is no calib.txt of KITTI, and cameras are a choice among its four")
+    if of_middlebury:
         return middlebury(text)
-    if re.search(r"^P(0|2|_rect_00|_rect_02):\s+[-+.\d]", text, re.MULTILINE):
+    if of_kitti:
         return kitti(text, cameras)
     if other is None and len(cameras_of := _documents(text)) == 2:
         text, other = cameras_of
@@ -192,7 +198,7 @@ def _is_camera_info(tree: Fields) -> bool:
 
 def _yaml(text: str) -> Fields:
     """The part of YAML that calibration files use: nested mappings, numbers, and lists in brackets or by dashes."""
-    text = re.sub(r"^%.*$|^---.*$|\s#.*$|^\.\.\.$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^%.*$|^---.*$|(?:^|\s)#.*$|^\.\.\.$", "", text, flags=re.MULTILINE)
     text = re.sub(r"\[[^\[\]]*\]", lambda match: re.sub(r"\s+", " ", match.group()), text)
     root: Fields = {}
     stack: list[tuple[int, Fields]] = [(-1, root)]

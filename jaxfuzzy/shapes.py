@@ -152,6 +152,10 @@ def fit_shapes(
     """
     array = checks.places(points)
     label = checks.labels(labels, len(array))
+    if label.max() >= len(array):
+        raise ValueError(
+            f"labels must count objects 0, 1, ..., fewer than the {len(array)} points, got {int(label.max())}"
+        )
     members = [np.flatnonzero(label == k) for k in range(int(label.max()) + 1)]
     fits = Fits(
         array,

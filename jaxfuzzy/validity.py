@@ -5,7 +5,7 @@ Paper symbols → words: k number of clusters, VRC variance ratio (eq. 6), S_W a
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,8 @@ from jaxfuzzy.solve import Effort, Solver
 Index = Literal[
     "vrc", "xie_beni", "partition_coefficient", "modified_partition_coefficient", "fuzzy_silhouette", "jump"
 ]
-INDICES = ("vrc", "xie_beni", "partition_coefficient", "modified_partition_coefficient", "fuzzy_silhouette", "jump")
+INDICES: tuple[Index, ...] = get_args(Index)
+RULES = ("paper", "best")
 # Where VRC rises to its upper end only, the paper takes the k before which it "increases rapidly": made exact as this ratio.
 ABRUPT = 2.0
 # Candidates fitted in lock step on a CPU, where it saves little that they are: all of them wait for the slowest.
@@ -101,7 +102,7 @@ def choose_k(
         raise ValueError(f"ks must hold at least one number and none twice, got {tuple(candidates)}")
     candidates.sort()
     checks.choice(index, "index", INDICES)
-    checks.choice(rule, "rule", ("paper", "best"))
+    checks.choice(rule, "rule", RULES)
     if candidates[0] == 1 and index not in ("jump", "partition_coefficient"):
         raise ValueError(f"ks must not hold 1 for index={index!r}, which cannot score one cluster; index='jump' can")
     if index == "jump" and candidates != list(range(1, len(candidates) + 1)):

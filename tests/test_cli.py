@@ -112,11 +112,27 @@ def test_options_reach_the_pipeline(run, modelled):
         "ks": (1, 2, 3), "noise_distance": 0.01, "kinds": ("box", "cone"), "up": (0.0, 0.0, 1.0), "ground": None,
         "rule": "paper",
     }  # fmt: skip
-    for camera, place in (("none", None), ("1,2,3.5", (1.0, 2.0, 3.5)), ("0,0,0", (0.0, 0.0, 0.0))):
+    for camera, place in (
+        ("none", None),
+        ("1,2,3.5", (1.0, 2.0, 3.5)),
+        ("0,0,0", (0.0, 0.0, 0.0)),
+        ("-.1,0,-2", (-0.1, 0.0, -2.0)),
+    ):
         assert run("shapes", "cloud.xyz", "--camera", camera)[0] == 0
         assert modelled["options"] == {"camera": place}
     assert run("shapes", "cloud.xyz", "-k", "auto", "--up", "auto", "--noise-distance", "auto")[0] == 0
     assert modelled["options"] == {"ks": "auto", "noise_distance": "auto", "up": "auto"}
+    assert run("shapes", "cloud.xyz", "--up", "-1,0,0")[0] == 0
+    assert modelled["options"] == {"up": (-1.0, 0.0, 0.0)}
+
+
+def test_where_an_error_came_from_is_shown_on_request(run, monkeypatch, capsys):
+    assert run("shapes", "none.ply")[0] == 2
+    monkeypatch.setenv("JAXFUZZY_TRACEBACK", "1")
+    assert cli.main(["shapes", "none.ply"]) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert last_line(err) == "jaxfuzzy: cloud not found: none.ply"
 
 
 def test_json_alone_on_standard_output(run, modelled):
@@ -311,7 +327,12 @@ def test_cluster_in_other_words(run):
     assert "noise: " in out
     assert json.loads(Path("labels.json").read_text())["columns"][-1] == "noise"
     status, out, _ = run("cluster", "points.csv", "--json", "--rule", "best", "--index", "xie_beni")
-    assert (status, json.loads(out)["k"]) == (0, 3)
+    assert (status, json.loads(out)["k"], json.loads(out)["index"]) == (0, 3, "xie_beni")
+    # The same k alone: of one candidate no index is taken.
+    whole, (status, out, _) = json.loads(out), run("cluster", "points.csv", "--json", "-k", "3")
+    assert (status, json.loads(out)["index"]) == (0, None)
+    # Two starts from the same seeds, one of them padded.
+    np.testing.assert_allclose(json.loads(out)["centers"], whole["centers"], atol=1e-5)
 
 
 def test_bad_tables(run, tmp_path):
@@ -352,6 +373,8 @@ def test_bad_tables(run, tmp_path):
         (("points.csv", "-m", "nan"), "m must be a finite number above 1.0, got nan"),
         (("points.csv", "-m", "many"), "argument -m: invalid float value: 'many'"),
         (("points.csv", "--index", "elbow"), "index must be one of 'vrc', "),
+        (("points.csv", "-k", "3", "--index", "elbow"), "index must be one of 'vrc', "),
+        (("points.csv", "-k", "3", "--rule", "mine"), "rule must be one of 'paper', 'best', got 'mine'"),
         (("points.csv", "--rule", "mine"), "rule must be one of 'paper', 'best', got 'mine'"),
         (("points.csv", "--noise-distance", "inf"), "must be a length above 0, got 'inf'"),
         (("points.csv", "--out", "labels.txt"), "out must end in one of .csv, .json, .npz, got labels.txt"),

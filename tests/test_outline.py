@@ -162,6 +162,7 @@ def test_nothing_is_seen_from_within_a_body():
         ("cylinder", {"radius": jnp.asarray(2.0)}),
         ("cone", {"apex": jnp.array([0, 3.0, 1.3]), "half_angle": jnp.asarray(0.6), "height": jnp.array([0.1, 5.0])}),
         ("sphere", {"radius": jnp.asarray(1.5)}),
+        ("box", {"size": jnp.array([4.0, 5.0, 6.0])}),
     ):
         before, _ = told(BODIES[name])
         around = dataclasses.replace(before, primitive=dataclasses.replace(before.primitive, **changes))

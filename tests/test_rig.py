@@ -280,6 +280,35 @@ def test_the_unit_of_an_own_file_can_be_told_and_other_options_are_refused(tmp_p
             load_rig(tmp_path / "rig.json", **options)
 
 
+def test_what_a_format_has_no_use_for_is_refused(tmp_path):
+    kitti, middlebury = put(tmp_path, KITTI, "kitti.txt"), tmp_path / "calib.txt"
+    middlebury.write_text(
+        "cam0=[700 0 320; 0 700 240; 0 0 1]\ncam1=[700 0 320; 0 700 240; 0 0 1]\ndoffs=0\nbaseline=120\n"
+    )
+    for path in (kitti, middlebury):
+        with pytest.raises(ValueError, match="which needs no second file"):
+            load_rig(path, kitti)
+    with pytest.raises(ValueError, match="a choice among its four"):
+        load_rig(middlebury, cameras=(0, 1))
+    assert load_rig(kitti, cameras=(2, 3)).baseline_m > 0
+
+
+def test_a_remark_before_the_first_entry_does_no_harm(tmp_path):
+    matrix = "[700, 0, 320, 0, 700, 240, 0, 0, 1]"
+    text = f"M1: {matrix}\nM2: {matrix}\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: [-0.12, 0, 0]\n"
+    assert_same(load_rig(put(tmp_path, "# my cameras\n" + text)), load_rig(put(tmp_path, text, "plain.yml")))
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path):
+    rig = Rig(**GIVEN | {"metric": np.True_, "image_size": (640, 480)})
+    save_rig(tmp_path / "rig.json", rig)
+    assert load_rig(tmp_path / "rig.json").metric is True
+    assert_same(rig.scaled(np.float32(0.5)), rig.scaled(0.5))
+    assert rig.scaled(np.int64(2)).image_size == (1280, 960)
+    with pytest.raises(ValueError, match="to must be a factor or whole numbers"):
+        rig.scaled((320.7, 240))
+
+
 def test_a_mark_of_byte_order_does_no_harm(tmp_path):
     """Windows editors write one before the text."""
     path = tmp_path / "calib.txt"
@@ -294,7 +323,7 @@ def test_a_mark_of_byte_order_does_no_harm(tmp_path):
         ({"focal_px": (700, 0)}, "focal_px must be finite and above 0"),
         ({"baseline_m": -0.1}, "baseline_m must be finite and above 0"),
         ({"baseline_m": float("nan")}, "baseline_m must be finite"),
-        ({"doffs_px": "x"}, "doffs_px must be 1 number"),
+        ({"doffs_px": "x"}, "doffs_px must be one number"),
         ({"metric": "false"}, "metric must be True or False, got 'false'"),
         ({"image_size": (640.5, 480)}, "whole numbers"),
         ({"rotation": np.eye(3)}, "rotation and translation must be given together"),

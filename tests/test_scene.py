@@ -7,10 +7,12 @@ from jaxfuzzy import scene as module
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
 from jaxfuzzy.fcm import fcm
+from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.render import paper_scene, render_pair, table_scene
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.scene import load_scene, model_cloud, model_scene
 from jaxfuzzy.seeding import histogram_seeds
+from jaxfuzzy.simulate import simulate_object
 from jaxfuzzy.stereo import example_pair, reconstruct
 from jaxfuzzy.validity import choose_k
 from jaxfuzzy.varieties import nfcv
@@ -45,7 +47,8 @@ def test_rendered_paper_scene_has_two_objects_of_the_right_kinds(modelled, paper
 
 
 def test_error_bars_of_a_scene_allow_for_neighbors_that_err_alike(modelled, paper_pair):
-    """Counted as independent, 217 times too many points, the radius' deviation would be fifteen times smaller."""
+    """Counted as independent, 190 times too many points, the radius' deviation would be fourteen times smaller."""
+    assert "cylinder" in [shape.kind for shape in modelled.shapes]
     for index, shape in zip(by_truth(modelled, paper_pair), modelled.shapes, strict=True):
         if shape.kind == "cylinder":
             error = abs(float(shape.primitive.radius) - float(paper_pair.objects[index].radius))
@@ -148,6 +151,47 @@ def test_wrong_options_are_named(options, error, word):
     points = np.random.default_rng(0).normal(size=(200, 3)) + [0, 0, 5]
     with pytest.raises(error, match=word):
         model_cloud(Cloud(points), **({"ground": None, "up": (0, 1, 0)} | options))
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"kinds": ("bx",)}, "kinds"),
+        ({"distance": "rays"}, "distance"),
+        ({"camera": (0, 0)}, "camera"),
+        ({"ks": (0,)}, "ks"),
+        ({"noise_distance": -1.0}, "noise_distance"),
+    ],
+)
+def test_wrong_options_are_told_before_the_work_begins(options, word):
+    """Before the pictures are read, which are not there."""
+    with pytest.raises(ValueError, match=word):
+        model_scene("nowhere.png", "nowhere.png", example_pair()[2], **options)
+
+
+def test_options_may_be_any_iterables_and_are_saved(tmp_path):
+    cloud = Cloud(simulate_object("cylinder", 3).points)
+    options = {"ground": None, "up": (0, 1, 0), "ks": range(1, 3), "kinds": iter(("cylinder", "box"))}
+    scene = model_cloud(cloud, **options)
+    assert [shape.kind for shape in scene.shapes] == ["cylinder"]
+    scene.save(tmp_path / "out")
+    settings = load_scene(tmp_path / "out").settings
+    assert (settings["ks"], settings["kinds"]) == ([1, 2], ["cylinder", "box"])
+
+
+def test_flecks_are_left_out_where_no_table_is_looked_for(paper_pair):
+    """Two specks of a few pixels before the wall: fewer than one independent point."""
+    cloud = reconstruct(paper_pair.left, paper_pair.right, paper_pair.rig)
+    pixels, points = np.asarray(cloud.pixels_px), np.asarray(cloud.points)
+    truth = paper_pair.labels[tuple(np.round(pixels).astype(int).T[::-1])]
+    fleck = (truth < 0) & (np.abs(pixels - pixels[truth < 0].min(axis=0)).max(axis=1) < 9)
+    kept = (truth >= 0) | fleck
+    assert 0 < fleck.sum() < PIXELS_PER_POINT
+    only = Cloud(points[kept], pixels_px=pixels[kept], depth_std=np.asarray(cloud.depth_std)[kept])
+    scene = model_cloud(only, ground=None, up=(0, -1, 0))
+    labels = np.asarray(scene.segmentation.labels)
+    assert (labels[fleck[kept]] == -1).all()
+    assert (labels >= 0).any()
 
 
 @pytest.mark.parametrize(("tilt", "seed"), [(6, 1), (11, 0), (18, 1), (26, 1)])

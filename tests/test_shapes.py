@@ -466,6 +466,8 @@ def test_wrong_arguments_are_named(options, error, word):
         fit_shape(points, **options)
     with pytest.raises(ValueError, match="labels"):
         fit_shapes(points, np.zeros(99, int))
+    with pytest.raises(ValueError, match="labels must count objects"):
+        fit_shapes(points, np.full(100, 300_000))
 
 
 @pytest.mark.slow

@@ -403,6 +403,15 @@ def test_noise_of_a_plane_by_construction(reach, known):
         measure_noise(values, mask & (rows < 0))
     with pytest.raises(DataError, match="half of 4 blocks"):
         measure_noise(values, (rows < 32) & (columns < 64))
+    for arguments, says in (
+        ({"mask": mask[:3]}, "mask must be booleans"),
+        ({"truth_px": truth[:3]}, "truth_px must have the shape of disparity_px"),
+        ({"block": 1}, "block must be at least 2"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            measure_noise(values, **{"mask": mask} | arguments)
+    exact = measure_noise(truth, mask, truth_px=truth)
+    assert (exact.std_px, exact.pixels_per_point) == (0.0, 1.0)
 
 
 def test_noise_of_a_rendered_table_is_that_against_its_truth(table, matched):
