@@ -216,7 +216,13 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="markers of a ChArUco board, as OpenCV names them (default: DICT_4X4_50)",
     )
-    add("--out", type=Path, default=Path("rig.json"), metavar="FILE", help="where to write the rig (default: rig.json)")
+    add(
+        "--out",
+        type=Path,
+        default=Path("rig.json"),
+        metavar="FILE",
+        help="where to write the rig: .json (default: rig.json), .yml, .xml for OpenCV, .txt as Middlebury",
+    )
 
 
 class _Parser(argparse.ArgumentParser):

@@ -214,19 +214,19 @@ def _cluster_result(
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    import dataclasses
-
     from jaxfuzzy.calibrate import calibrate
-    from jaxfuzzy.rig import save_rig
+    from jaxfuzzy.rig import fields_of, save_rig
+    from jaxfuzzy.rigwriters import check_suffix, own_tree
 
     _check_file(args.out, *args.left, *args.right)
+    check_suffix(args.out.suffix.lower(), "out")
     board = {"board": args.board, "square_m": args.square, "marker_m": args.marker, "dictionary": args.dictionary}
     with Progress(args.quiet) as progress:
         progress("looking for the board", 0.0)
         rig = calibrate(args.left, args.right, **board)
         save_rig(args.out, rig)
     if args.json:
-        show(json.dumps(dataclasses.asdict(rig), allow_nan=False))
+        show(json.dumps(own_tree(fields_of(rig)), allow_nan=False))
         return DONE
     found = rig.calibration
     show(f"focal length {rig.focal_px[0]:.2f} px, baseline {1e3 * rig.baseline_m:.2f} mm")

@@ -9,15 +9,15 @@ import dataclasses
 import json
 import os
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxfuzzy import rigfiles
+from jaxfuzzy import checks, rigfiles
 from jaxfuzzy.files import one_line, read_bytes, write_atomic
+from jaxfuzzy.rigwriters import SCHEMA, VERSION, written
 
-SCHEMA = "jaxfuzzy/rig"
-VERSION = 1
 # Calibration files have a few thousand bytes; looking through a huge text line by line would only seem to hang.
 LARGEST_FILE = 1 << 20
 PLAUSIBLE_BASELINE_M = (1e-3, 10.0)
@@ -140,12 +140,19 @@ class Rig:
             size = None if self.image_size is None else (round(self.image_size[0] * sx), round(self.image_size[1] * sy))
         else:
             width, height = _vector(to, "to", 2, positive=True)
+            if self.image_size is None:
+                raise ValueError("to must be a factor, since this rig does not know its image_size")
             if width % 1 or height % 1:
                 raise ValueError(f"to must be a factor or whole numbers (width, height), got {to!r}")
             size = (int(width), int(height))
-            if self.image_size is None:
-                raise ValueError("to must be a factor, since this rig does not know its image_size")
             sx, sy = width / self.image_size[0], height / self.image_size[1]
+            # Sizes of resized images are rounded, by a pixel at most.
+            if abs(sx - sy) > 1 / self.image_size[0] + 1 / self.image_size[1]:
+                warnings.warn(
+                    f"images of {self.image_size[0]} x {self.image_size[1]} are now {size[0]} x {size[1]}, narrower or wider than"
+                    " before: if they were cropped, not resized, move center_px in place of scaling",
+                    stacklevel=2,
+                )
 
         def focal(pair: tuple[float, float]) -> tuple[float, float]:
             return pair[0] * sx, pair[1] * sy
@@ -210,6 +217,8 @@ def load_rig(
         FileNotFoundError: There is no such file.
         ValueError: It is not a rig's file, or does not hold what metres need.
     """
+    checks.flag(arbitrary_units, "arbitrary_units")
+    checks.flag(rectified, "rectified")
     text = _text(path)
     if cameras is not None and np.shape(cameras) != (2,):
         raise TypeError(f"cameras must be two numbers such as (0, 1), got {cameras!r}")
@@ -242,14 +251,26 @@ def warn_of_unit(rig: Rig, whose: str, advice: str) -> None:
 
 
 def save_rig(path: str | os.PathLike[str], rig: Rig) -> None:
-    """Writes a rig as JSON, whole or not at all.
+    """Writes a rig, whole or not at all, in the format that the name ends in.
+
+    Args:
+        path: A file ending in `.json`, this library's own, which alone holds everything; in `.yml`, `.yaml` or `.xml`, OpenCV's
+            FileStorage, with M1, D1, M2, D2, R and T, or P1, P2 and Q of rectified cameras; or in `.txt`, Middlebury's
+            `calib.txt` (lengths in millimetres) of rectified ones.
+        rig: The rig.
 
     Raises:
         OSError: The folder does not exist or cannot be written.
+        ValueError: The name ends in something else, or such a file cannot hold this rig.
+        TypeError: It is no rig.
     """
-    fields = {name: value for name, value in dataclasses.asdict(rig).items() if value is not None}
-    text = json.dumps({"schema": SCHEMA, "version": VERSION} | fields, indent=2)
-    write_atomic(path, (text + "\n").encode())
+    fields = fields_of(checks.kind(rig, "rig", Rig, "load_rig reads one from a file"))
+    write_atomic(path, written(fields, Path(path).suffix.lower()).encode())
+
+
+def fields_of(rig: Rig) -> rigfiles.Fields:
+    """The fields of a rig that are known."""
+    return {name: value for name, value in dataclasses.asdict(rig).items() if value is not None}
 
 
 def _from_fields(fields: rigfiles.Fields, unit: float | None, arbitrary_units: bool) -> Rig:
@@ -260,7 +281,8 @@ def _from_fields(fields: rigfiles.Fields, unit: float | None, arbitrary_units: b
     if missing and not arbitrary_units:
         words = " and no ".join(name.removesuffix("_m").removesuffix("_px") for name in missing)
         raise ValueError(
-            f"holds no {words}, without which lengths in metres are unknown; arbitrary_units=True goes on without"
+            f"holds no {words}, without which lengths in metres are unknown; arbitrary_units=True, or --arbitrary-units, goes on"
+            " without"
         )
     if "baseline_m" in missing:
         fields["baseline_m"], unit = 1.0, 1.0

@@ -6,6 +6,7 @@ does not hold is None or absent, and `rig.load_rig` decides whether that is an e
 
 import json
 import re
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from typing import Any
@@ -26,6 +27,8 @@ ALIASES = {
     "p2": "p2 projectionmatrix2 pr projectionright",
     "q": "q disptodepthmatrix disparitytodepth reprojection",
 }
+# Numbers of one rig that should be the same differ by rounding at most.
+ALIKE_PX = 0.5
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -64,8 +67,17 @@ def middlebury(text: str) -> Fields:
     if len(left) != 9 or (right is not None and len(right) != 9):
         raise ValueError("cam0 and cam1 must be 3 x 3 matrices")
     doffs = _entry(entries, "doffs")
-    if doffs is None and right is not None:
-        doffs = right[2] - left[2]
+    if right is not None:
+        apart = right[2] - left[2]
+        doffs = apart if doffs is None else doffs
+        said = {"doffs": (doffs, apart), "focal length": (left[0], right[0]), "row of the center": (left[5], right[5])}
+        for what, (one, other) in said.items():
+            if abs(one - other) > ALIKE_PX:
+                warnings.warn(
+                    f"calib.txt contradicts itself: the {what} is {one:g} px by one entry and {other:g} by another, of a pair"
+                    " that should be rectified; the first is used",
+                    stacklevel=5,
+                )
     width, height = _entry(entries, "width"), _entry(entries, "height")
     return {
         "focal_px": (left[0], left[4]),
@@ -124,6 +136,11 @@ def opencv(tree: Fields, *, rectified: bool) -> Fields:
             raise ValueError("holds neither M1, M2, R, T nor P1, P2 nor Q, so it is no stereo calibration")
         return fields | {"image_size": size}
     left, right = _shaped(found, "m1", 3, 3), _shaped(found, "m2", 3, 3)
+    for name, camera in (("M1", left), ("M2", right)):
+        if not np.allclose(camera[2], [0, 0, 1]):
+            raise ValueError(
+                f"{name} must end in the row 0, 0, 1, got {camera[2].tolist()}: some programs write it transposed"
+            )
     translation = np.ravel(found["t"])
     rotation = _rotation(np.asarray(found["r"], float))
     if translation.shape != (3,):
@@ -207,7 +224,7 @@ def _yaml(text: str) -> Fields:
         if not line.strip():
             continue
         indent = len(line) - len(line.lstrip())
-        if (dash := re.match(r"\s*-\s+(.*)", line)) and last:
+        if (dash := re.match(r"\s*(?:-\s+)+(.*)", line)) and last:
             parent, name = last
             if not isinstance(parent[name], list):
                 parent[name] = []
@@ -282,8 +299,16 @@ def _camera_info(tree: Fields) -> Fields:
 
 def _projections(left: np.ndarray, right: np.ndarray) -> Fields:
     """A rectified pair from its projection matrices: the right one ends in minus focal length times baseline."""
+    if not (left[0, 0] > 0 and right[0, 0] > 0):
+        raise ValueError(f"has the focal lengths {left[0, 0]:g} and {right[0, 0]:g} px: it was never calibrated")
     if abs(left[1, 3] - right[1, 3]) > abs(left[0, 3] - right[0, 3]):
         raise ValueError("has one camera above the other; only side by side is supported: turn the images by 90°")
+    for what, place in (("focal length", (0, 0)), ("row of the center", (1, 2))):
+        if abs(left[place] - right[place]) > ALIKE_PX:
+            raise ValueError(
+                f"contradicts itself: the {what} is {left[place]:g} px on the left and {right[place]:g} on the right, though"
+                " projections are those of rectified cameras"
+            )
     return {
         "focal_px": (float(left[0, 0]), float(left[1, 1])),
         "center_px": (float(left[0, 2]), float(left[1, 2])),

@@ -16,7 +16,7 @@ ORDER = """
     packing objects rays bounds starts local choice candidates screening finalists search polish fitting looks assembly mostpoints
     quadrics
     shapes trials joining dividing groups
-    cloudfiles cloud planes ground rigfiles rig reproject matcher photos calibrate brightness stereo render
+    cloudfiles cloud planes ground rigfiles rigwriters rig reproject matcher photos calibrate brightness stereo render
     flecks steps outline pieces occlusion evidence rivals vertical patches naming scene
     losses tuning sensitivity drawing plot export folder page report table
     estimators arguments terminal
@@ -25,7 +25,7 @@ ORDER = """
 DOORS = {
     "cv2": {
         "rig",
-        "rigfiles",
+        "rigwriters",
         "stereo",
         "photos",
         "calibrate",

@@ -426,7 +426,8 @@ def test_calibrate(run, shared_data):
     assert json.loads(Path("rig.json").read_text())["schema"] == "jaxfuzzy/rig"
     status, out, err = run("calibrate", *left, "--right", *right, "--square", "0.025", "--json", "--quiet")
     assert (status, err) == (0, "")
-    assert json.loads(out)["image_size"] == [640, 480]
+    # What is printed is what the file holds, so that either can be given to --rig.
+    assert json.loads(out) == json.loads(Path("rig.json").read_text())
 
 
 def test_ready_disparities_and_resized_pictures_reach_the_pipeline(run, modelled):
@@ -465,6 +466,7 @@ def test_bad_calibration(run, tmp_path):
         ((*pair, "--board", "9"), 2, "must be inner corners such as 9x6, got '9'"),
         ((*pair, "--out", "nowhere/rig.json"), 2, "out must be in an existing folder"),
         ((*pair, "--out", "."), 2, "out must be a file, got the folder ."),
+        ((*pair, "--out", "rig.pdf"), 2, "out must end in one of .json, .yml, .yaml, .xml, .txt, got .pdf"),
         (("missing.png", "--right", "right.png", "--square", "0.02"), 2, "missing.png"),
         (pair, 1, "was found in 0 of 1 pairs"),
     ):

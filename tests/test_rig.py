@@ -293,6 +293,98 @@ def test_what_a_format_has_no_use_for_is_refused(tmp_path):
     assert load_rig(kitti, cameras=(2, 3)).baseline_m > 0
 
 
+def test_what_contradicts_itself_is_told(tmp_path):
+    text = "cam0=[700 0 320; 0 700 240; 0 0 1]\ncam1=[700 0 372; 0 700 240; 0 0 1]\ndoffs={}\nbaseline=120\n"
+    assert load_rig(put(tmp_path, text.format(52))).doffs_px == 52
+    for wrong, says in (
+        (text.format(0), "doffs is 0 px by one entry and 52"),
+        (text.format(-52), "doffs is -52"),
+        (text.format(52).replace("cam1=[700", "cam1=[525"), "focal length is 700 px by one entry and 525"),
+        (text.format(52).replace("240; 0 0 1]\ndoffs", "140; 0 0 1]\ndoffs"), "row of the center is 240"),
+    ):
+        with pytest.warns(UserWarning, match=says):
+            load_rig(put(tmp_path, wrong))
+    left, right = "P1: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]", "P2: [{}, 0, 320, -50, 0, 500, {}, 0, 0, 0, 1, 0]"
+    assert load_rig(put(tmp_path, f"{left}\n{right.format(500, 240)}\n")).baseline_m == pytest.approx(0.1)
+    for focal, row, says in ((1000, 240, "focal length is 500"), (500, 140, "row of the center is 240")):
+        with pytest.raises(ValueError, match=says):
+            load_rig(put(tmp_path, f"{left}\n{right.format(focal, row)}\n"))
+    turned = "M1: [500, 0, 0, 0, 500, 0, 320, 240, 1]\nM2: [500, 0, 0, 0, 500, 0, 320, 240, 1]\n"
+    with pytest.raises(ValueError, match="M1 must end in the row 0, 0, 1"):
+        load_rig(put(tmp_path, turned + "R: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: [-0.1, 0, 0]\n"))
+
+
+def test_a_camera_that_was_never_calibrated(tmp_path):
+    """What ROS drivers publish until somebody calibrates: zeros."""
+    text = "image_width: 640\nimage_height: 480\n"
+    for name, count in (("camera_matrix", 9), ("rectification_matrix", 9), ("projection_matrix", 12)):
+        text += f"{name}:\n  rows: 3\n  cols: {count // 3}\n  data: {[0] * count}\n"
+    path = put(tmp_path, text)
+    with pytest.raises(ValueError, match="never calibrated"):
+        load_rig(path, path)
+
+
+def test_lists_of_dashes(tmp_path):
+    """As PyYAML writes nested lists."""
+    block = lambda name, rows: (
+        f"{name}:\n" + "".join(("- " if i == 0 else "  ") + f"- {x}\n" for row in rows for i, x in enumerate(row))
+    )
+    camera = [[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]
+    text = block("M1", camera) + block("M2", camera) + block("R", np.eye(3)) + "T:\n- -0.1\n- 0.0\n- 0.0\n"
+    rig = load_rig(put(tmp_path, text))
+    assert (rig.focal_px, rig.center_px, rig.baseline_m) == ((500.0, 510.0), (320.0, 240.0), pytest.approx(0.1))
+
+
+RECTIFIED = Rig((700.5, 710.25), (300.0, 200.5), 0.12, (640, 480), doffs_px=31.125, max_disparity_px=64)
+RAW = Rig(
+    (700.5, 710.25),
+    (300.0, 200.5),
+    0.12,
+    (640, 480),
+    right_focal_px=(690.0, 691.0),
+    right_center_px=(310.0, 210.0),
+    rotation=((1.0, 0.0, 0.0), (0.0, 0.8, -0.6), (0.0, 0.6, 0.8)),
+    translation=(-0.12, 0.0, 0.0),
+    distortion=((0.1, -0.2, 0.001, 0.002, 0.03), (0.2, 0.1, 0.0, 0.0, -0.1)),
+)
+
+
+@pytest.mark.parametrize("suffix", ["json", "yml", "yaml", "xml", "txt"])
+def test_written_rigs_come_back(tmp_path, suffix):
+    """Every format holds all there is but OpenCV's, which knows no bound of the disparity."""
+    path = tmp_path / f"rig.{suffix}"
+    save_rig(path, RECTIFIED)
+    bound = 64 if suffix in ("json", "txt") else None
+    assert_same(load_rig(path), dataclasses.replace(RECTIFIED, max_disparity_px=bound))
+    if suffix == "txt":
+        with pytest.raises(ValueError, match="cameras that are not rectified"):
+            save_rig(path, RAW)
+    else:
+        save_rig(path, RAW)
+        assert_same(load_rig(path), RAW)
+
+
+def test_opencv_reads_what_is_written(tmp_path):
+    save_rig(tmp_path / "rig.yml", RECTIFIED)
+    file = cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
+    q, place = file.getNode("Q").mat(), np.array([100.0, 50.0, 20.0, 1.0])
+    x, _, z, w = q @ place
+    # f B / (d + doffs), as the module says.
+    np.testing.assert_allclose(z / w, 700.5 * 0.12 / (20 + 31.125), rtol=1e-12)
+    np.testing.assert_allclose(x / w, (100 - 300) / 700.5 * z / w, rtol=1e-12)
+
+
+def test_rigs_are_written_in_known_formats_alone(tmp_path):
+    for name in ("rig", "rig.pdf"):
+        with pytest.raises(ValueError, match=r"path must end in one of \.json, \.yml"):
+            save_rig(tmp_path / name, RECTIFIED)
+    with pytest.raises(ValueError, match="arbitrary units"):
+        save_rig(tmp_path / "rig.yml", dataclasses.replace(RECTIFIED, metric=False))
+    with pytest.raises(TypeError, match="rig must be a Rig, got NoneType"):
+        save_rig(tmp_path / "rig.json", None)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_remark_before_the_first_entry_does_no_harm(tmp_path):
     matrix = "[700, 0, 320, 0, 700, 240, 0, 0, 1]"
     text = f"M1: {matrix}\nM2: {matrix}\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: [-0.12, 0, 0]\n"
@@ -348,7 +440,8 @@ def test_impossible_rigs_are_refused(change, says):
 def test_scaling_keeps_every_ray_and_depth():
     """A pixel's corner keeps its place in the picture; f, c and doffs scale, the baseline does not."""
     rig = Rig((700, 710), (300.0, 200.0), 0.12, (640, 480), doffs_px=31.0, max_disparity_px=64)
-    half = rig.scaled((320, 120))
+    with pytest.warns(UserWarning, match="if they were cropped"):
+        half = rig.scaled((320, 120))
     assert half.baseline_m == rig.baseline_m
     assert half.image_size == (320, 120)
     assert half.max_disparity_px == 32
