@@ -10,8 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfuzzy import cloudfiles
-from jaxfuzzy.arrays import Array, Float, Int, as_float, record
+from jaxfuzzy import checks, cloudfiles
+from jaxfuzzy.arrays import Array, Float, Int, as_float, extents, record
 from jaxfuzzy.files import one_line, read_bytes, write_atomic
 
 SUFFIXES = (".ply", ".pcd", ".npy", ".npz", ".csv", ".xyz", ".txt")
@@ -40,6 +40,30 @@ class Cloud:
     status: Int[Array, ""] | int = 0
 
 
+def check_cloud(cloud: Any) -> np.ndarray:
+    """The points (N, 3) of a cloud on the host, its other fields being theirs.
+
+    Raises:
+        TypeError: It is no cloud.
+        ValueError: A field has another shape, or holds what cannot be.
+    """
+    checks.kind(cloud, "cloud", Cloud, "Cloud(points) makes one, read_cloud reads one")
+    points = np.asarray(checks.places(cloud.points, "cloud.points"))
+    for name, width in (("colors", 3), ("pixels_px", 2)):
+        if (value := getattr(cloud, name)) is None:
+            continue
+        array = np.asarray(checks.points(value, f"cloud.{name}", dims=width))
+        if len(array) != len(points):
+            raise ValueError(f"cloud.{name} must have shape ({len(points)}, {width}), got {array.shape}")
+        if name == "colors" and not np.all((array >= -COLOR_SLACK) & (array <= 1 + COLOR_SLACK)):
+            raise ValueError(f"cloud.colors must be 0 to 1, got {array.min():g} to {array.max():g}")
+        if name == "pixels_px" and len(array) > 1 and not extents(array).any():
+            raise ValueError(
+                f"cloud.pixels_px must be the column and row of each point, got {array[0].tolist()} for all"
+            )
+    return points
+
+
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """Reads a point cloud: PLY, PCD, NPY, NPZ, CSV or XYZ, told apart by content. Nothing is unpickled.
 
@@ -49,7 +73,8 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is in none of these formats, damaged, cut short, or holds no finite point.
+        ValueError: It is in none of these formats, damaged, cut short, holds no finite point, or points so far from the origin
+            that the precision of JAX does not tell them apart.
     """
     data = read_bytes(path, "cloud")
     try:
@@ -67,6 +92,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         finite = np.isfinite(np.stack([*points.T, *beside.values()])).all(axis=0)
         if not finite.any():
             raise ValueError(f"holds no finite point, out of {len(points)}")
+        checks.places(points[finite])
     except ValueError as error:
         raise ValueError(f"cloud {os.fspath(path)} {one_line(error)}") from None
     if not finite.all():
@@ -115,6 +141,7 @@ def write_cloud(
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {os.fspath(path)}")
+    checks.kind(cloud, "cloud", Cloud, "Cloud(points) makes one")
     points = np.asarray(cloud.points)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise ValueError(f"cloud.points must have shape (N, 3) with at least one point, got {points.shape}")

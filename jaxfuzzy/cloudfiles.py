@@ -228,10 +228,11 @@ def parse_numpy(data: bytes) -> Columns:
     if points.ndim not in (2, 3) or points.shape[-1] < 3 or points.dtype.kind not in "fiu":
         raise ValueError(f"{name} must be numbers of shape (N, 3) or (H, W, 3), got {points.dtype} {points.shape}")
     flat = points.reshape(-1, points.shape[-1])
-    columns: Columns = dict(zip("xyz", flat.T[:3], strict=True))
+    columns = _unnamed(flat)
     colors = next((arrays[other] for other in ("colors", "rgb") if other in arrays), None)
-    if colors is not None and colors.shape[-1:] == (3,) and colors.size == 3 * len(flat):
-        columns |= dict(zip(("red", "green", "blue"), colors.reshape(-1, 3).T, strict=True))
+    # With or without an opacity.
+    if colors is not None and colors.shape[-1:] in ((3,), (4,)) and colors.size == colors.shape[-1] * len(flat):
+        columns |= dict(zip(("red", "green", "blue"), colors.reshape(len(flat), -1).T[:3], strict=True))
     if "pixels_px" in arrays and arrays["pixels_px"].shape == (len(flat), 2):
         columns |= dict(zip(("column_px", "row_px"), arrays["pixels_px"].T, strict=True))
     for other, values in arrays.items():
@@ -248,16 +249,20 @@ def parse_text(data: bytes) -> Columns:
     """Rows of numbers separated by commas, semicolons or blanks, with or without a line of names; # starts a comment.
 
     Without names the first three are x, y, z; three further columns of whole numbers 0..255 are a color. CloudCompare puts //
-    before its names, and how many points follow after them.
+    before its names, and how many points follow after them. Spreadsheets put numbers in quotes, and leave out unknown ones.
     """
     if b"\0" in data[:LONGEST_HEADER]:
         raise ValueError("is in no known format (PLY, PCD, NPY, NPZ, CSV, XYZ)")
     rows = [row for line in data.decode("utf-8", "replace").splitlines() if (row := line.split("#")[0].strip())]
     if not rows:
         raise ValueError("holds no points")
-    delimiter = next((mark for mark in ",;" if mark in rows[0]), None)
+    delimiter = next((mark for mark in ",;" if any(mark in row for row in rows[:2])), None)
+    if delimiter is not None and all(row.endswith(delimiter) for row in rows):
+        rows = [row[:-1] for row in rows]
     names = [word.strip().strip('"').lower() for word in rows[0].split(delimiter)]
-    if all(_is_number(word) for word in names):
+    if delimiter is not None:
+        rows = _filled(rows, delimiter)
+    if any(names) and all(not word or _is_number(word) for word in names):
         if len(names) == 1 and len(rows) > 1 and len(rows[1].split(delimiter)) >= 3:
             count, rows = _count(names[0], "the first line"), rows[1:]  # PTS: how many points follow
         else:
@@ -265,11 +270,7 @@ def parse_text(data: bytes) -> Columns:
         table = _table(rows, delimiter, count, exact=True)
         if table.shape[1] < 3:
             raise ValueError(f"must have at least three columns, x, y and z, got {table.shape[1]}")
-        columns: Columns = dict(zip("xyz", table.T[:3], strict=True))
-        rest = table[:, 3:6]
-        if table.shape[1] == 6 and np.all((rest >= 0) & (rest <= 255) & (rest == np.round(rest))) and rest.max() > 1:
-            columns |= dict(zip(("red", "green", "blue"), rest.T.astype(np.uint8), strict=True))
-        return columns
+        return _unnamed(table)
     if names[0].startswith("//"):
         names[0] = names[0].removeprefix("//").strip()
         names = names[0 if names[0] else 1 :]
@@ -281,6 +282,25 @@ def parse_text(data: bytes) -> Columns:
     if table.shape[1] != len(names):
         raise ValueError(f"has {len(names)} names but {table.shape[1]} columns")
     return dict(zip(_unique(names), table.T, strict=True))
+
+
+def _unnamed(table: np.ndarray) -> Columns:
+    """Columns of rows (N, 3 or more) without names: x, y, z, and a color where three others look like one."""
+    columns: Columns = dict(zip("xyz", table.T[:3], strict=True))
+    rest = table[:, 3:6]
+    if table.shape[1] == 6 and np.all((rest >= 0) & (rest <= 255) & (rest == np.round(rest))) and rest.max() > 1:
+        columns |= dict(zip(("red", "green", "blue"), rest.T.astype(np.uint8), strict=True))
+    return columns
+
+
+def _filled(rows: list[str], delimiter: str) -> list[str]:
+    """Rows without quotes, and with "nan" where a cell is empty."""
+    empty, ends = delimiter + delimiter, (row[0] + row[-1] for row in rows)
+    if not any(delimiter in end for end in ends) and not any(
+        '"' in row or empty in row.replace(" ", "") for row in rows
+    ):
+        return rows
+    return [delimiter.join(cell.strip().strip('"') or "nan" for cell in row.split(delimiter)) for row in rows]
 
 
 def write_ply(columns: Columns, *, ascii: bool) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, Float, Int, all_on_device, on_device, record, static
-from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.cloud import Cloud, check_cloud
 from jaxfuzzy.flecks import in_flecks
 from jaxfuzzy.ground import fit_ground, foreground
 from jaxfuzzy.looks import compiling_ahead
@@ -214,14 +214,11 @@ def _model(
     weights: Any = None,
     **options: Any,
 ) -> Scene:
-    checks.kind(cloud, "cloud", Cloud, "Cloud(points) makes one, read_cloud reads one")
     # Picked from on the host: each number of points picked in JAX would compile and keep a program of its own.
-    points = np.asarray(checks.places(cloud.points, "cloud.points"))
+    points = check_cloud(cloud)
     count = points.shape[0]
     heaviness = checks.weights(weights, count)
     checks.noise_distance_or_auto(noise_distance, count)
-    if cloud.pixels_px is not None and cloud.pixels_px.shape != (count, 2):
-        raise ValueError(f"cloud.pixels_px must have shape ({count}, 2), got {cloud.pixels_px.shape}")
     division, naming = RULES[rule]
     seen = Seen(
         points=points,

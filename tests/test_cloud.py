@@ -4,6 +4,7 @@ import io
 import pickle
 import struct
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -210,6 +211,11 @@ PCD_TEXT = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\
         ("marked.csv", "\ufeffx,y,z\r\n1,2,3\r\n4,5,6\r\n", False),
         ("cloudcompare.txt", "//X Y Z R G B\n2\n1 2 3 255 0 0\n4 5 6 0 0 255\n", True),
         ("spaced.txt", "// X Y Z R G B\n1 2 3 255 0 0\n4 5 6 0 0 255\n", True),
+        ("quoted.csv", '"x","y","z"\n"1","2","3"\n"4","5","6"\n', False),
+        ("quoted.xyz", '"1","2","3"\n"4","5","6"\n', False),
+        ("ending.csv", "x,y,z,\n1,2,3,\n4,5,6,\n", False),
+        ("gaps.csv", "x,y,note,z\n1,2,,3\n4,5,7,6\n", False),
+        ("counted.csv", "2\n1,2,3\n4,5,6\n", False),
         ("capitals.ply", PLY_TEXT.replace("float x", "float X").replace("float z", "float Z"), False),
         ("comments.pcd", "#.PCD v.7\n# by hand\n" + PCD_TEXT.replace("ascii", "ASCII"), False),
     ],
@@ -220,6 +226,32 @@ def test_text(tmp_path, name, text, colored):
     assert (back.colors is not None) == colored
     if colored:
         np.testing.assert_array_equal(back.colors, [[1, 0, 0], [0, 0, 1]])
+
+
+def test_a_gap_among_coordinates_is_no_point(tmp_path):
+    """As pandas writes what is not known."""
+    with pytest.warns(UserWarning, match="1 of 3 points are not finite"):
+        back = read_cloud(put(tmp_path, "a.csv", "x,y,z\n1,2,3\n1,,3\n4,5,6\n"))
+    np.testing.assert_array_equal(back.points, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_colors_of_numpy_files(tmp_path):
+    """In three further columns, as in a text file, or with an opacity."""
+    np.save(tmp_path / "six.npy", np.array([[1, 2, 3, 255, 0, 0], [4, 5, 6, 0, 0, 255.0]]))
+    np.savez(
+        tmp_path / "four.npz", points=np.array([[1, 2, 3], [4, 5, 6.0]]), colors=np.eye(4, dtype=np.uint8)[[0, 2]] * 255
+    )
+    for name in ("six.npy", "four.npz"):
+        np.testing.assert_array_equal(read_cloud(tmp_path / name).colors, [[1, 0, 0], [0, 0, 1]])
+
+
+def test_points_that_their_precision_does_not_tell_apart(tmp_path):
+    """A metre of the world in metres of a map: single precision has steps of half a metre there."""
+    far = np.random.default_rng(0).uniform(0, 1, (50, 3)) + [500_000, 4_600_000, 100]
+    np.save(tmp_path / "far.npy", far)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "far.npy").points, far)
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"points lie up to 4\.6e\+06 .* subtract an offset"):
+        read_cloud(tmp_path / "far.npy")
 
 
 def test_a_column_that_is_no_whole_number_is_left_as_it_is(tmp_path):
@@ -364,6 +396,8 @@ def test_wrong_use(tmp_path):
         write_cloud(tmp_path / "cloud.ply", full_cloud(), extra={"id": np.array([1, 2, 2**40 + 7])})
     with pytest.raises(ValueError, match="colors must be 0 to 1, got 0 to 255"):
         write_cloud(tmp_path / "cloud.ply", Cloud(POINTS, COLORS))
+    with pytest.raises(TypeError, match="cloud must be a Cloud, got ndarray"):
+        write_cloud(tmp_path / "cloud.ply", POINTS)
     with pytest.raises(OSError, match="cannot write"):
         write_cloud(tmp_path / "no" / "cloud.ply", full_cloud())
     assert list(tmp_path.iterdir()) == [], "something half-written was left behind"

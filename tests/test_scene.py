@@ -229,7 +229,15 @@ def test_arguments_of_another_kind_are_named(paper_pair):
     with pytest.raises(TypeError, match="matcher must be a Matcher, got 'sgbm'"):
         model_scene(paper_pair.left, paper_pair.right, paper_pair.rig, matcher="sgbm")
     with pytest.raises(ValueError, match=r"cloud.pixels_px must have shape \(200, 2\), got \(5, 2\)"):
-        model_cloud(Cloud(points, pixels_px=np.zeros((5, 2))))
+        model_cloud(Cloud(points, pixels_px=np.random.default_rng(0).normal(size=(5, 2))))
+    for fields, says in (
+        ({"pixels_px": np.zeros((200, 2))}, "cloud.pixels_px must be the column and row of each point"),
+        ({"pixels_px": np.full((200, 2), np.nan)}, "cloud.pixels_px must be finite"),
+        ({"colors": np.zeros((5, 3))}, r"cloud.colors must have shape \(200, 3\)"),
+        ({"colors": np.full((200, 3), 255.0)}, "cloud.colors must be 0 to 1"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            model_cloud(Cloud(points, **fields))
 
 
 def test_bad_pairs_are_refused_with_one_clear_line(paper_pair, tmp_path):
