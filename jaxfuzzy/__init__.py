@@ -22,6 +22,7 @@ from jaxfuzzy.fcm import memberships as memberships
 from jaxfuzzy.ground import find_ground as find_ground
 from jaxfuzzy.ground import upright as upright
 from jaxfuzzy.matcher import Matcher as Matcher
+from jaxfuzzy.photos import read_depth as read_depth
 from jaxfuzzy.photos import read_disparity as read_disparity
 from jaxfuzzy.photos import rectify as rectify
 from jaxfuzzy.primitives import Box as Box

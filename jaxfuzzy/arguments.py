@@ -40,6 +40,7 @@ MODEL = """examples:
   jaxfuzzy model left.png right.png --rig rig.json -k 1:4 --kinds box,cylinder --out found
   jaxfuzzy model left.png right.png --rig intrinsics.yml --rig extrinsics.yml --unit 0.001
   jaxfuzzy model left.png right.png --rig calib.txt --disparity raft.pfm
+  jaxfuzzy model color.png --rig calib.txt --depth depth.png --depth-scale 1000
   jaxfuzzy model left.png right.png --rig rig.json --json --quiet | jq '.shapes[].kind'"""
 SHAPES = """examples:
   jaxfuzzy shapes cloud.ply
@@ -125,7 +126,13 @@ def _scene(command: argparse.ArgumentParser) -> None:
 def _model(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("left", type=Path, metavar="LEFT", help="left image")
-    add("right", type=Path, metavar="RIGHT", help="right image, of the same size")
+    add(
+        "right",
+        type=Path,
+        nargs="?",
+        metavar="RIGHT",
+        help="right image, of the same size; not needed with --disparity or --depth",
+    )
     add(
         "--rig",
         type=Path,
@@ -155,6 +162,26 @@ def _model(command: argparse.ArgumentParser) -> None:
         default=1.0,
         metavar="N",
         help="what that file's numbers are divided by, such as 16 or 256 (default: 1)",
+    )
+    add("--depth", type=Path, metavar="FILE", help="depths of the left image in metres instead, of the same formats")
+    add(
+        "--depth-scale",
+        type=_length,
+        default=1.0,
+        metavar="N",
+        help="what that file's numbers are divided by, such as 1000 for millimetres (default: 1)",
+    )
+    add(
+        "--min-disparity",
+        type=int,
+        metavar="N",
+        help="smallest disparity to search, below 0 for cameras that look inwards (default: from the scene)",
+    )
+    add(
+        "--disparities",
+        type=int,
+        metavar="N",
+        help="how many disparities to search, a multiple of 16 (default: from the scene)",
     )
     _scene(command)
 

@@ -2,8 +2,9 @@
 
 import dataclasses
 import itertools
+import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import cv2
@@ -38,8 +39,8 @@ class _View:
 
 
 def calibrate(
-    left_images: Sequence[Any],
-    right_images: Sequence[Any],
+    left_images: Iterable[Any],
+    right_images: Iterable[Any],
     *,
     board: tuple[int, int] = (9, 6),
     square_m: float,
@@ -65,13 +66,17 @@ def calibrate(
 
     Raises:
         FileNotFoundError: An image does not exist.
+        TypeError: An argument is of another kind.
         ValueError: The lists differ in length or hold the same picture, an image or the board cannot be used.
         DataError: The board was found in fewer than 3 pairs or always in the same pose, the lists are swapped, or their pairs are
             not of the same moments.
     """
+    left_images, right_images = (
+        _several(images, name) for images, name in ((left_images, "left_images"), (right_images, "right_images"))
+    )
     if len(left_images) != len(right_images):
         raise ValueError(f"left_images and right_images must be pairs, got {len(left_images)} and {len(right_images)}")
-    if len(board) != 2:
+    if np.shape(board) != (2,):
         raise ValueError(f"board must be two numbers of inner corners, got {board}")
     for side in board:
         checks.integer(side, "board", at_least=3)
@@ -156,7 +161,8 @@ def _sharpened(image: Image, corners: np.ndarray, numbers: np.ndarray, across: i
 
 
 def _charuco(board: tuple[int, int], square_m: float, marker_m: float, dictionary: str) -> Any:
-    if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
+    known = isinstance(dictionary, str) and dictionary.startswith("DICT_") and hasattr(cv2.aruco, dictionary)
+    if not known:
         raise ValueError(f"dictionary must be one of OpenCV's names such as 'DICT_4X4_50', got {dictionary!r}")
     checks.number(marker_m, "marker_m", above=0.0)
     if marker_m >= square_m:
@@ -180,6 +186,13 @@ def _charuco(board: tuple[int, int], square_m: float, marker_m: float, dictionar
 
     find.places = np.asarray(pattern.getChessboardCorners(), np.float32)  # type: ignore[attr-defined]
     return find
+
+
+def _several(images: Any, name: str) -> Sequence[Any]:
+    """Several photographs, in order."""
+    if isinstance(images, str | os.PathLike) or not isinstance(images, Iterable):
+        raise TypeError(f"{name} must be several paths or arrays, got {images!r}")
+    return list(images)
 
 
 def _views(

@@ -76,9 +76,12 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _model(args: argparse.Namespace) -> int:
-    from jaxfuzzy.photos import read_disparity, read_grey
+    from jaxfuzzy.matcher import Matcher
+    from jaxfuzzy.photos import read_depth, read_disparity, read_grey
     from jaxfuzzy.rig import load_rig
 
+    if args.right is None and args.disparity is None and args.depth is None:
+        raise ValueError("RIGHT must be given, unless --disparity or --depth is")
     if len(args.rig) > 2:
         raise ValueError(f"--rig takes one or two files, got {len(args.rig)}")
     rig = load_rig(*args.rig, unit_m=args.unit, rectified=args.rectified, arbitrary_units=args.arbitrary_units)
@@ -86,10 +89,14 @@ def _model(args: argparse.Namespace) -> int:
         raise ValueError("--resized needs a rig that says how large its images are, which this file does not")
     if args.resized:
         rig = rig.scaled(read_grey(args.left, "left").shape[::-1])
-    ready = {}
+    given: dict[str, Any] = {}
     if args.disparity is not None:
-        ready["disparity_px"] = read_disparity(args.disparity, scale=args.disparity_scale)
-    return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **ready, **options))
+        given["disparity_px"] = read_disparity(args.disparity, scale=args.disparity_scale)
+    if args.depth is not None:
+        given["depth_m"] = read_depth(args.depth, scale=args.depth_scale)
+    if args.min_disparity is not None or args.disparities is not None:
+        given["matcher"] = Matcher(min_disparity=args.min_disparity, disparities=args.disparities)
+    return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **given, **options))
 
 
 def _shapes(args: argparse.Namespace) -> int:

@@ -28,8 +28,11 @@ def read_bytes(path: str | os.PathLike[str], what: str) -> bytes:
 
     Raises:
         FileNotFoundError: There is no such file.
+        TypeError: It is no path.
         ValueError: It is a folder, empty, or may not be read.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(f"{what} must be the path of a file, got {type(path).__name__}")
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{what} not found: {path}")

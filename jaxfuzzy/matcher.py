@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import numpy as np
+
 from jaxfuzzy import checks
 
 METHODS = ("sgbm", "hh", "bm")
@@ -67,7 +69,7 @@ class Matcher:
         checks.integer(self.block, f"block with method={self.method!r}", at_least=1, at_most=largest)
         if self.block % 2 == 0:
             raise ValueError(f"block must be odd, got {self.block}")
-        if len(self.smoothness) != 2 or not 0 < self.smoothness[0] < self.smoothness[1]:
+        if np.shape(self.smoothness) != (2,) or not 0 < self.smoothness[0] < self.smoothness[1]:
             raise ValueError(f"smoothness must be two prices, 0 < first < second, got {self.smoothness}")
         highest = HIGHEST_PRICE / (CHANNELS * self.block**2)
         if self.method != "bm" and not self.smoothness[1] <= highest:
@@ -80,6 +82,7 @@ class Matcher:
             checks.number(self.left_right_px, "left_right_px", above=0.0)
         checks.integer(self.speckle_px, "speckle_px", at_least=0, at_most=2**31 - 1)
         checks.integer(self.edge_px, "edge_px", at_least=0, at_most=20)
+        checks.flag(self.refine, "refine")
         if self.disparity_std_px is not None:
             checks.number(self.disparity_std_px, "disparity_std_px", above=0.0)
 

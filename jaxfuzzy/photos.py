@@ -11,6 +11,7 @@ import numpy as np
 from jaxfuzzy import checks
 from jaxfuzzy.files import one_line, read_arrays, read_bytes
 from jaxfuzzy.rig import Rig
+from jaxfuzzy.rigfiles import NUMBER
 
 Image = np.ndarray  # uint8, grey (H, W) or BGR (H, W, 3)
 
@@ -78,9 +79,11 @@ def _eight_bits(image: np.ndarray, top: float) -> Image:
 
 
 def _decoded(data: bytes) -> Any:
-    """The image in a file's bytes; None where it is none that OpenCV reads."""
+    """The image in a file's bytes, turned as a JPEG file says, like `cv2.imread`; None where it is none that OpenCV reads."""
+    # Unchanged images are not turned; JPEG has no opacity that could be lost.
+    how = cv2.IMREAD_ANYCOLOR if data.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        return cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except (cv2.error, MemoryError):  # it says a size that it cannot have
         return None
 
@@ -114,6 +117,8 @@ def _image(value: Any, name: str) -> np.ndarray:
 def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.ndarray:
     """Reads a ready disparity map, float32 (H, W) in pixels; NaN where it is unknown.
 
+    Maps of 16-bit numbers with a sign are OpenCV's fixed point, and refused without their scale.
+
     Args:
         path: A PFM file (rows from the bottom, infinite where unknown), a PNG or TIFF (0 where unknown), or NPY or NPZ
             with one map (not finite where unknown).
@@ -124,8 +129,27 @@ def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.nd
         FileNotFoundError: There is no such file.
         ValueError: It is no disparity map.
     """
+    return _map(path, scale, "disparity")
+
+
+def read_depth(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.ndarray:
+    """Reads a depth map, float32 (H, W) in metres; NaN where it is unknown.
+
+    Args:
+        path: A PFM, PNG, TIFF, NPY or NPZ file, as `read_disparity` reads them.
+        scale: What the file's numbers are divided by: 1000 for millimetres, which depth cameras give.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no depth map.
+    """
+    return _map(path, scale, "depth")
+
+
+def _map(path: str | os.PathLike[str], scale: float, what: str) -> np.ndarray:
+    """One number a pixel; NaN where it is unknown."""
     checks.number(scale, "scale", above=0.0)
-    data, is_image = read_bytes(path, "disparity"), False
+    data, is_image = read_bytes(path, what), False
     try:
         if data.startswith((b"Pf", b"PF")):
             values = _pfm(data)
@@ -142,20 +166,29 @@ def read_disparity(path: str | os.PathLike[str], *, scale: float = 1.0) -> np.nd
             values = image[:, :, 0] if image.ndim == 3 and np.ptp(image[:, :, :3], axis=2).max() == 0 else image
         if values.ndim != 2 or values.dtype.kind not in "fiu":
             raise ValueError(f"must hold one number a pixel, got {values.dtype} {values.shape}")
+        if what == "disparity" and values.dtype.kind == "i" and values.dtype.itemsize == 2 and scale == 1:
+            raise ValueError("holds int16, which is OpenCV's fixed point: give scale=16, or --disparity-scale 16")
     except ValueError as error:
-        raise ValueError(f"disparity {os.fspath(path)} {one_line(error)}") from None
+        raise ValueError(f"{what} {os.fspath(path)} {one_line(error)}") from None
     known = np.isfinite(values) & ((values > 0) if is_image or values.dtype.kind != "f" else True)
     return np.where(known, values.astype(np.float32) / np.float32(scale), np.float32(np.nan))
 
 
 def _pfm(data: bytes) -> np.ndarray:
-    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", data)
-    if head is None:
+    between = rb"(?:\s+|#[^\n]*\n)+"
+    head = re.match(
+        rb"Pf" + between + rb"(\d+)" + between + rb"(\d+)" + between + rb"([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?:\r\n|\s)",
+        data,
+    )
+    if head is None or not NUMBER.fullmatch(head[3].decode()) or float(head[3]) == 0:
         raise ValueError("is not a PFM file of one channel")
     width, height = int(head[1]), int(head[2])
     kind = np.dtype("<f4" if float(head[3]) < 0 else ">f4")
-    if len(data) - head.end() < width * height * kind.itemsize:
-        raise ValueError(f"is cut short: {width} x {height} pixels are promised")
+    there, promised = len(data) - head.end(), width * height * kind.itemsize
+    if there != promised:
+        raise ValueError(
+            f"is {'cut short' if there < promised else 'longer than it says'}: {width} x {height} pixels are promised"
+        )
     return np.frombuffer(data, kind, width * height, head.end()).reshape(height, width)[::-1]
 
 

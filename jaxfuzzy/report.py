@@ -79,7 +79,7 @@ def to_dict(scene: "Scene") -> dict[str, Any]:
             "schema": SCHEMA,
             "version": VERSION,
             "units": {"length": "m" if scene.rig is None or scene.rig.metric else "arbitrary", "angle": "rad"},
-            "frame": "left camera: x right, y down, z forward",
+            "frame": "as in the cloud given" if scene.rig is None else "left camera: x right, y down, z forward",
             "made_with": _versions(),
             "settings": scene.settings,
             "timings": scene.timings,

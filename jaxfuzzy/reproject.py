@@ -215,7 +215,10 @@ def _map(value: np.ndarray, name: str, rig: Rig) -> np.ndarray:
             f" {value.shape[0]} and {value.shape[1]}; rig.scaled((width, height)) makes the rig of a resized image"
         )
     if not rig.rectified:
-        raise ValueError("rig must be rectified, since disparities are those of rectified images: see rectify")
+        raise ValueError(
+            f"rig must be rectified, since {name} is that of rectified images: see rectify, or where the rig's file describes raw"
+            " cameras too, load_rig(..., rectified=True), --rectified"
+        )
     return value.astype(np.float64 if value.dtype == np.float64 else np.float32)
 
 

@@ -228,18 +228,24 @@ def load_rig(
             given = {"other": other is not None, "cameras": cameras is not None, "rectified": rectified}
             if wrong := [name for name, is_given in given.items() if is_given]:
                 raise ValueError(f"is this library's own JSON, which has no use for {' and '.join(wrong)}")
-            rig = _in_metres(_from_json(text), 1.0 if unit is None else unit)
+            unit = 1.0 if unit is None else unit
+            rig = _in_metres(_from_json(text), unit)
         else:
             second = None if other is None else _text(other)
-            rig = _from_fields(
-                rigfiles.parse(text, second, cameras=cameras, rectified=rectified), unit, arbitrary_units
-            )
+            fields = rigfiles.parse(text, second, cameras=cameras, rectified=rectified)
+            of_format = fields.pop("unit_m", 1.0)
+            unit = of_format if unit is None else unit
+            rig = _from_fields(fields, unit, arbitrary_units)
     except ValueError as error:
         raise ValueError(f"rig {os.fspath(path)} {one_line(error)}") from None
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"rig {os.fspath(path)} is damaged or no calibration file ({type(error).__name__})") from None
+    other_unit = 0.001 if unit == 1 else 1
     warn_of_unit(
-        rig, f"rig {os.fspath(path)}", "if the file's unit is not the metre, say so, for instance unit_m=0.001"
+        rig,
+        f"rig {os.fspath(path)}",
+        f"its lengths were read in units of {unit:g} m; where that is wrong, say so, for instance unit_m={other_unit}, or --unit"
+        f" {other_unit}",
     )
     return rig
 
@@ -273,10 +279,8 @@ def fields_of(rig: Rig) -> rigfiles.Fields:
     return {name: value for name, value in dataclasses.asdict(rig).items() if value is not None}
 
 
-def _from_fields(fields: rigfiles.Fields, unit: float | None, arbitrary_units: bool) -> Rig:
-    """The rig in metres, where the file's unit is another one or not the one that its format has."""
-    unit = fields.pop("unit_m", 1.0) if unit is None else unit
-    fields.pop("unit_m", None)
+def _from_fields(fields: rigfiles.Fields, unit: float, arbitrary_units: bool) -> Rig:
+    """The rig in metres."""
     missing = [name for name in ("baseline_m", "doffs_px") if fields.get(name) is None]
     if missing and not arbitrary_units:
         words = " and no ".join(name.removesuffix("_m").removesuffix("_px") for name in missing)

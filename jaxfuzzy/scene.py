@@ -21,7 +21,7 @@ from jaxfuzzy.naming import Seen, named
 from jaxfuzzy.objects import OF_SCENE, PIXELS_PER_POINT
 from jaxfuzzy.photos import read_pair, rectify
 from jaxfuzzy.primitives import Plane
-from jaxfuzzy.reproject import cloud_from_disparity
+from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.segment import Segmentation, candidates_of, segment
 from jaxfuzzy.shapes import Shape, distance_of, kinds_of
@@ -111,6 +111,8 @@ def model_scene(
     *,
     matcher: Matcher | None = None,
     disparity_px: Any = None,
+    depth_m: Any = None,
+    depth_std: Any = None,
     progress: Progress | None = None,
     **options: Any,
 ) -> Scene:
@@ -118,11 +120,14 @@ def model_scene(
 
     Args:
         left: The left image: a path, or a uint8 array, grey (H, W) or BGR (H, W, 3) as `cv2.imread` gives it.
-        right: The right image, of the same size.
-        rig: The cameras.
+        right: The right image, of the same size. It may be None where disparities or depths are given.
+        rig: The cameras; of a depth camera only focal length and center matter, where `depth_std` is given.
         matcher: How to match.
         disparity_px: Disparities (H, W) of the left image from any other matcher, in pixels, not finite or not above 0 where
             unknown (see `read_disparity`); rectified images are then not matched, and of `matcher` the error of a disparity counts.
+        depth_m: Depths (H, W) in metres along the optical axis of the left image instead, as a depth camera gives them (see
+            `read_depth`).
+        depth_std: Their standard deviation, one number or one a pixel (H, W); None takes the rig's stereo error.
         progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
         **options: Those of `model_cloud`.
 
@@ -131,22 +136,30 @@ def model_scene(
 
     Raises:
         FileNotFoundError: An image does not exist.
-        ValueError: An image or an option cannot be used, or sizes disagree.
+        ValueError: An image or an option cannot be used, or sizes disagree; both disparities and depths are given.
         DataError: Fewer than 50 pixels were matched, or fewer than 50 points stand above the ground.
     """
     options = _checked(options)
+    if disparity_px is not None and depth_m is not None:
+        raise ValueError("disparity_px and depth_m must not both be given")
+    if depth_std is not None and depth_m is None:
+        raise ValueError("depth_std must come with depth_m")
+    ready = disparity_px is not None or depth_m is not None
     clock = _Clock(progress)
     with clock.stage("matching"):
-        image, image_right = read_pair(left, right, rig)
-        if disparity_px is None and not rig.rectified:
+        image, image_right = read_pair(left, left if ready and right is None else right, rig)
+        if not ready and not rig.rectified:
             image, image_right, rig = rectify(image, image_right, rig)
-        if disparity_px is None:
-            cloud = reconstruct(image, image_right, rig, matcher=matcher)
-        else:
+        if depth_m is not None:
+            cloud = cloud_from_depth(depth_m, None, rig, image=image, depth_std=depth_std)
+        elif disparity_px is not None:
             std_px = chosen(matcher).disparity_std_px
             cloud = cloud_from_disparity(disparity_px, None, rig, image=image, disparity_std_px=std_px)
+        else:
+            cloud = reconstruct(image, image_right, rig, matcher=matcher)
     scene = _model(cloud, clock, **options)
-    return dataclasses.replace(scene, image=_as_rgb(image), image_right=_as_rgb(image_right), rig=rig)
+    pictures: dict[str, Any] = {"image": _as_rgb(image), "image_right": None if right is None else _as_rgb(image_right)}
+    return dataclasses.replace(scene, **pictures, rig=rig)
 
 
 def model_cloud(cloud: Cloud, *, progress: Progress | None = None, **options: Any) -> Scene:

@@ -24,7 +24,7 @@ from jaxfuzzy.matcher import FURTHEST_PX, STEP, Matcher, chosen
 from jaxfuzzy.photos import Alignment, Image, alignment, grey, read_pair, rectify
 from jaxfuzzy.reproject import TO_STD, cloud_from_disparity, usual_std_px
 from jaxfuzzy.rig import Rig, load_rig
-from jaxfuzzy.status import Status
+from jaxfuzzy.status import Status, describe
 
 MODES = {"sgbm": cv2.StereoSGBM_MODE_SGBM_3WAY, "hh": cv2.StereoSGBM_MODE_HH}
 FEWEST_POINTS = 50
@@ -74,7 +74,7 @@ def reconstruct(left: Any, right: Any, rig: Rig, *, matcher: Matcher | None = No
             f"only {count} of {valid.size} pixels were matched, {FEWEST_POINTS} are needed: check that the images are"
             f" rectified ({rows}), the range of disparities, and that there is texture"
         )
-    status = int(Status.MISALIGNED) * (abs(found.rows_px) > MISALIGNED_PX or found.corners_px > ROLLED_PX)
+    status = int(Status.MISALIGNED) * _misaligned(found)
     status |= int(Status.FEW_MATCHES) * (count < FEW_MATCHES_SHARE * valid.size)
     cloud = cloud_from_disparity(disparity_px, valid, rig, image=left, disparity_std_px=matcher.disparity_std_px)
     return dataclasses.replace(cloud, status=int(cloud.status) | status)
@@ -102,9 +102,22 @@ def disparity(
     matcher = chosen(matcher)
     left, right = read_pair(left, right, rig)
     if not rig.rectified:
-        raise ValueError("rig must be rectified for matching: rectify the pair first, or use reconstruct")
-    _checked(left, right, matcher)
-    return _matched(left, right, rig, matcher)
+        raise ValueError(
+            "rig must be rectified for matching: rectify the pair first, or use reconstruct; where the images are rectified"
+            " already, load_rig(..., rectified=True)"
+        )
+    found = _checked(left, right, matcher)
+    values, valid = _matched(left, right, rig, matcher)
+    if _misaligned(found):
+        warnings.warn(describe(Status.MISALIGNED), stacklevel=2)
+    if not np.asarray(valid).any():
+        warnings.warn("no pixel was matched: check the range of disparities, and that there is texture", stacklevel=2)
+    return values, valid
+
+
+def _misaligned(found: Alignment) -> bool:
+    """Whether rows differ by so much that matching suffers."""
+    return abs(found.rows_px) > MISALIGNED_PX or found.corners_px > ROLLED_PX
 
 
 def _checked(left: Image, right: Image, matcher: Matcher) -> Alignment:
@@ -116,7 +129,7 @@ def _checked(left: Image, right: Image, matcher: Matcher) -> Alignment:
         raise DataError(
             "left and right seem to be swapped: things appear further right in the right image"
             f" ({found.disparity_px[1]:.0f} px in the middle of {found.matches} matches); where that is right because the"
-            " cameras look inwards, give Matcher(min_disparity=...)"
+            " cameras look inwards, give Matcher(min_disparity=...), or --min-disparity"
         )
     return found
 
@@ -191,14 +204,16 @@ def _glance(left: Image, right: Image, rig: Rig, matcher: Matcher) -> tuple[int,
         end = np.inf if count is None else begin + count
         missed = np.mean((found < begin - shrink) | (found >= end + shrink))
         if missed > MISSED_SHARE:
+            until = max(begin, min(end, last))
             warnings.warn(
-                f"disparities of {begin:.0f} to {min(end, last):.0f} px are searched, but {100 * missed:.0f} % of the picture has"
+                f"disparities of {begin:.0f} to {until:.0f} px are searched, but {100 * missed:.0f} % of the picture has"
                 f" others, from {found[skip]:.0f} to {found[-1 - skip]:.0f}: what lies there is missing, or wrong",
                 stacklevel=2,
             )
     first, last = int(np.floor(first)), int(np.ceil(last))
     low = first if low is None else low
-    count = STEP * max(1, -(-(last + 1 - low) // STEP)) if count is None else count
+    if count is None:  # no more than the picture is wide, as what is searched ends in the padding beyond
+        count = STEP * min(max(1, -(-(last + 1 - low) // STEP)), -(-width // STEP))
     check(count)
     if not -FURTHEST_PX <= low <= low + count <= FURTHEST_PX + STEP:
         raise ValueError(

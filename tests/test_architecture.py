@@ -113,8 +113,8 @@ PUBLIC = """
     Seeds Segmentation Shape Solver Sphere Status Tuned Varieties
     blocks calibrate choose_k cloud_from_depth cloud_from_disparity conditioning describe disparity example_pair fcm
     find_ground fit_shape fit_shapes fuzzy_silhouette histogram_seeds influence load_rig load_scene measure_noise memberships
-    model_cloud model_scene nfcv partition_coefficient principal_axes read_cloud read_disparity reconstruct recover rectify
-    save_rig segment tune upright variance_ratio write_cloud xie_beni
+    model_cloud model_scene nfcv partition_coefficient principal_axes read_cloud read_depth read_disparity reconstruct recover
+    rectify save_rig segment tune upright variance_ratio write_cloud xie_beni
 """.split()
 
 

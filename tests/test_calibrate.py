@@ -191,6 +191,15 @@ def test_wrong_use(odd_board):
         calibrate(lefts, rights)
     with pytest.raises(ValueError, match="square_m must be a finite number above 0"):
         calibrate(lefts, rights, square_m=0.0)
+    for name, wrong in (("left_images", "left.png"), ("right_images", 3)):
+        with pytest.raises(TypeError, match=f"{name} must be several paths or arrays"):
+            calibrate(**{"left_images": lefts, "right_images": rights} | {name: wrong}, square_m=SQUARE)
+    with pytest.raises(ValueError, match="board must be two numbers"):
+        calibrate(lefts, rights, board=9, square_m=SQUARE)
+    with pytest.raises(ValueError, match="dictionary must be one of OpenCV's names"):
+        calibrate(lefts, rights, square_m=SQUARE, marker_m=SQUARE / 2, dictionary=5)
+    with pytest.raises(DataError, match="found in 0 of 2 pairs"):
+        calibrate(iter(lefts[:2]), map(np.array, rights[:2]), board=(4, 9), square_m=SQUARE)
     with pytest.raises(ValueError, match="board must be at least 3"):
         calibrate(lefts, rights, board=(7, 1), square_m=SQUARE)
     with pytest.raises(DataError, match=r"found in 0 of 2 pairs, 3 are needed \(board not found"):

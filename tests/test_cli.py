@@ -8,12 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import jsonschema
 import numpy as np
 import pytest
 
 import jaxfuzzy.scene
 from jaxfuzzy import cli, plot, report, table, terminal
+from jaxfuzzy.matcher import Matcher
 from jaxfuzzy.rig import Rig, save_rig
 from synthetic import SCHEMA, empty_scene, make_scene
 
@@ -440,9 +442,25 @@ def test_ready_disparities_and_resized_pictures_reach_the_pipeline(run, modelled
     assert modelled["options"] == {"up": (0.0, -1.0, 0.0)}
     assert run(*words, "--disparity", "map.npy", "--disparity-scale", "16")[0] == 0
     assert (modelled["options"]["disparity_px"] == 10).all()
-    status, _, err = run(*words, "--disparity", "none.pfm")
+    cv2.imwrite("depth.png", np.full((96, 128), 1500, np.uint16))
+    assert run("model", "left.png", *words[3:], "--depth", "depth.png", "--depth-scale", "1000")[0] == 0
+    assert modelled["inputs"][1] is None
+    assert (modelled["options"]["depth_m"] == 1.5).all()
+    assert run(*words, "--min-disparity", "-16", "--disparities", "48")[0] == 0
+    assert modelled["options"]["matcher"] == Matcher(min_disparity=-16, disparities=48)
+    np.save("raw.npy", np.full((96, 128), 160, np.int16))
+    for more, says in (
+        (("--disparity", "none.pfm"), "disparity not found: none.pfm"),
+        (("--depth", "none.png"), "depth not found: none.png"),
+        (("--disparity", "raw.npy"), "is OpenCV's fixed point: give scale=16, or --disparity-scale 16"),
+        (("--disparities", "40"), "disparities must be a multiple of 16, got 40"),
+    ):
+        status, _, err = run(*words, *more)
+        assert status == 2
+        assert says in last_line(err)
+    status, _, err = run("model", "left.png", *words[3:])
     assert status == 2
-    assert "disparity not found: none.pfm" in last_line(err)
+    assert "RIGHT must be given, unless --disparity or --depth is" in last_line(err)
 
 
 def test_no_photograph_is_overwritten(run, tmp_path):

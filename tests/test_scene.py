@@ -220,6 +220,27 @@ def test_disparities_of_another_matcher_take_the_place_of_matching(paper_pair):
         model_scene(paper_pair.left, paper_pair.right, paper_pair.rig, disparity_px=truth[:100])
 
 
+def test_depths_of_a_depth_camera_take_the_place_of_matching(paper_pair, tmp_path):
+    depth = np.where(paper_pair.visible, paper_pair.depth_m, np.nan)
+    scene = model_scene(paper_pair.left, None, paper_pair.rig, depth_m=depth, depth_std=0.001)
+    assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
+    assert float(scene.shapes[0].primitive.radius) == pytest.approx(0.045, abs=1e-4)
+    assert scene.image_right is None
+    scene.save(tmp_path / "out")
+    again = load_scene(tmp_path / "out")
+    np.testing.assert_array_equal(again.image, scene.image)
+    assert again.image_right is None
+    for wrong, says in (
+        ({"depth_m": depth, "disparity_px": depth}, "must not both be given"),
+        ({"depth_std": 0.001}, "depth_std must come with depth_m"),
+        ({"depth_m": (1000 * paper_pair.depth_m).astype(np.uint16)}, "depth_m must be in metres"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            model_scene(paper_pair.left, None, paper_pair.rig, **wrong)
+    with pytest.raises(TypeError, match="right must be an image or a path, got None"):
+        model_scene(paper_pair.left, None, paper_pair.rig)
+
+
 def test_arguments_of_another_kind_are_named(paper_pair):
     points = np.random.default_rng(0).normal(size=(200, 3)) + [0, 0, 5]
     with pytest.raises(TypeError, match=r"cloud must be a Cloud, got ndarray; Cloud\(points\) makes one"):

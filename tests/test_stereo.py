@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import struct
+import warnings
 
 import cv2
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxfuzzy.brightness import Line, evened, line_between
 from jaxfuzzy.calibrate import calibrate
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.matcher import Matcher
-from jaxfuzzy.photos import alignment, read_disparity, read_pair, rectify
+from jaxfuzzy.photos import alignment, read_depth, read_disparity, read_pair, rectify
 from jaxfuzzy.primitives import Sphere
 from jaxfuzzy.render import Setting, paper_scene, render_pair, table_scene
 from jaxfuzzy.reproject import cloud_from_depth, cloud_from_disparity, measure_noise, usual_std_px
@@ -243,6 +244,32 @@ def test_narrow_images_are_refused_and_answers_repeat():
     for other in others:
         np.testing.assert_array_equal(first[0], other[0])
     np.testing.assert_allclose(np.median(first[0][first[1]]), 4, atol=0.05)
+
+
+@pytest.mark.parametrize("width", [40, 48, 56, 64, 72])
+def test_narrow_images_need_no_range(width):
+    """The range that is looked for is never wider than the picture: a strip of 48 pixels was refused for 64 disparities."""
+    left, right, rig = example_pair()
+    left, right = (np.ascontiguousarray(cv2.imread(str(path))[:, :width]) for path in (left, right))
+    narrow = dataclasses.replace(rig, image_size=(width, left.shape[0]))
+    _, count = search_range(left, right, narrow, Matcher())
+    assert count <= 16 * -(-width // 16)
+    disparity(left, right, narrow)
+
+
+def test_photographs_are_turned_as_their_files_say(tmp_path):
+    """As `cv2.imread` does: a camera held upside down writes so into its JPEG files."""
+    picture = np.zeros((40, 60, 3), np.uint8)
+    picture[:10] = 255
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    # A TIFF directory of one entry: orientation 3.
+    tag = b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x112, 3, 1, 3, 0, 0)
+    path = tmp_path / "turned.jpg"
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + data[2:])
+    turned = cv2.imread(str(path))
+    assert turned[-5:].min() > 200
+    rig = Rig((100, 100), (30, 20), 0.1, (60, 40))
+    np.testing.assert_array_equal(read_pair(path, turned, rig)[0], turned)
 
 
 def test_fractions_are_neither_truncated_nor_on_a_grid(table, matched):
@@ -506,6 +533,10 @@ def test_rows_that_differ_are_measured_and_told(down, told):
     assert not found.swapped
     cloud = reconstruct(picture.left, picture.right, picture.rig)
     assert bool(cloud.status & Status.MISALIGNED) == told
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        disparity(picture.left, picture.right, picture.rig)
+    assert any("Rows of the two images do not match" in str(one.message) for one in caught) == told
 
 
 def test_nothing_is_said_about_rows_where_features_repeat(shared_data):
@@ -670,6 +701,8 @@ def test_images_that_cannot_be_used(left, right, error, says):
         ({"min_disparity": -4096}, ValueError, "min_disparity must be at least -2047"),
         ({"method": "fast"}, ValueError, "method must be one of 'sgbm', 'hh', 'bm', got 'fast'"),
         ({"smoothness": (8, 8)}, ValueError, "0 < first < second"),
+        ({"smoothness": 5}, ValueError, "smoothness must be two prices"),
+        ({"refine": "no"}, TypeError, "refine must be True or False"),
         ({"left_right_px": 0.0}, ValueError, "left_right_px must be a finite number above 0"),
         ({"min_disparity": 1.5}, TypeError, "min_disparity must be a whole number"),
         ({"disparity_std_px": -1}, ValueError, "disparity_std_px must be"),
@@ -729,9 +762,14 @@ def test_encodings_of_ready_disparities(tmp_path):
         str(tmp_path / "color.png"), np.repeat(np.nan_to_num(truth * 8).astype(np.uint8)[:, :, None], 3, axis=2)
     )
     np.testing.assert_array_equal(read_disparity(tmp_path / "color.png", scale=8), truth)
-    for scale, order in (("-0.003922", "<"), ("1.0", ">")):
+    for head, order in (
+        ("Pf\n3 2\n-0.003922\n", "<"),
+        ("Pf\n3 2\n1.0\n", ">"),
+        ("Pf\r\n3 2\r\n-1.0\r\n", "<"),
+        ("Pf\n# by hand, 9 9\n3 2\n-1\n", "<"),
+    ):
         body = np.where(np.isnan(truth), np.inf, truth)[::-1].astype(f"{order}f4").tobytes()
-        (tmp_path / "a.pfm").write_bytes(f"Pf\n3 2\n{scale}\n".encode() + body)
+        (tmp_path / "a.pfm").write_bytes(head.encode() + body)
         np.testing.assert_array_equal(read_disparity(tmp_path / "a.pfm"), truth)
     np.savez(tmp_path / "a.npz", np.where(np.isnan(truth), np.inf, truth))
     np.testing.assert_array_equal(read_disparity(tmp_path / "a.npz"), truth)
@@ -742,6 +780,9 @@ def test_encodings_of_ready_disparities(tmp_path):
     [
         (b"Pf\n300 200\n-1\n" + struct.pack("<f", 1.0), "cut short: 300 x 200"),
         (b"PF\n3 2\n-1\n" + bytes(72), "not a PFM file of one channel"),
+        (b"Pf\n3 2\n-1\n" + bytes(25), "longer than it says: 3 x 2"),
+        (b"Pf\n3 2\n0\n" + bytes(24), "not a PFM file of one channel"),
+        (b"Pf\n3 2\n-e\n" + bytes(24), "not a PFM file of one channel"),
         (b"hello", "no image, PFM, NPY or NPZ"),
         (b"PK\x03\x04", "disparity"),
     ],
@@ -750,6 +791,23 @@ def test_damaged_disparity_files(tmp_path, data, says):
     (tmp_path / "bad").write_bytes(data)
     with pytest.raises(ValueError, match=says):
         read_disparity(tmp_path / "bad")
+
+
+def test_opencvs_fixed_point_needs_its_scale(tmp_path):
+    np.save(tmp_path / "raw.npy", np.full((2, 3), 160, np.int16))
+    with pytest.raises(ValueError, match="is OpenCV's fixed point: give scale=16"):
+        read_disparity(tmp_path / "raw.npy")
+    np.testing.assert_array_equal(read_disparity(tmp_path / "raw.npy", scale=16), np.full((2, 3), 10))
+
+
+def test_depth_maps(tmp_path):
+    cv2.imwrite(str(tmp_path / "depth.png"), np.array([[0, 1500], [250, 4000]], np.uint16))
+    expected = np.array([[np.nan, 1.5], [0.25, 4.0]], np.float32)
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.png", scale=1000), expected)
+    np.save(tmp_path / "depth.npy", np.full((2, 3), 1500, np.int16))
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.npy", scale=1000), np.full((2, 3), 1.5))
+    with pytest.raises(FileNotFoundError, match="depth not found"):
+        read_depth(tmp_path / "none.png")
 
 
 # Photographs
