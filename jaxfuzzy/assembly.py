@@ -10,8 +10,7 @@ from jaxfuzzy import bounds
 from jaxfuzzy.fitting import Judged, assemble_batch, judged
 from jaxfuzzy.looks import Look, Settings, side_by_side
 from jaxfuzzy.objects import BATCH, DEVIATIONS, Frame, batches
-from jaxfuzzy.primitives import Primitive
-from jaxfuzzy.search import KINDS
+from jaxfuzzy.primitives import KINDS, Primitive
 
 
 class Bounded(NamedTuple):

@@ -13,7 +13,8 @@ import numpy as np
 from jaxfuzzy.arrays import on_host
 from jaxfuzzy.choice import PLANE_BONUS
 from jaxfuzzy.objects import PIXELS_PER_POINT
-from jaxfuzzy.search import KINDS, MORE
+from jaxfuzzy.primitives import KINDS
+from jaxfuzzy.search import MORE
 from jaxfuzzy.shapes import FAMILIES, Shape
 from jaxfuzzy.status import Status
 from jaxfuzzy.trials import lies, refused

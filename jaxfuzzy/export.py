@@ -11,13 +11,13 @@ import numpy as np
 
 from jaxfuzzy import drawing
 from jaxfuzzy.fitting import distances
-from jaxfuzzy.primitives import KINDS
+from jaxfuzzy.primitives import PRIMITIVES
 
 if TYPE_CHECKING:
     from jaxfuzzy.scene import Scene
 
 # The number that stands for each kind in the cloud's `kind` column; 0 is no object.
-KIND_NUMBERS = {name: number for number, name in enumerate((*KINDS, "unknown"), start=1)}
+KIND_NUMBERS = {name: number for number, name in enumerate((*PRIMITIVES, "unknown"), start=1)}
 _GLTF_UNSIGNED_INT, _GLTF_FLOAT = 5125, 5126
 _GLTF_VERTICES, _GLTF_INDICES = 34962, 34963
 

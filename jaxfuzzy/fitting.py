@@ -12,7 +12,7 @@ from jaxfuzzy.arrays import WIDE, Array
 from jaxfuzzy.candidates import Candidates
 from jaxfuzzy.objects import MOST, Frame, Prepared, opened
 from jaxfuzzy.packing import leaf, packed, unpacked
-from jaxfuzzy.primitives import Primitive
+from jaxfuzzy.primitives import KINDS, Primitive
 
 FAMILIES = (polish.PLANE, polish.BOX, polish.REVOLUTION, polish.REVOLUTION, polish.SPHERE)
 # Several objects are searched at a time, each by one thread: that takes a twentieth less than to share out the work on each.
@@ -33,7 +33,7 @@ class Start(NamedTuple):
 
 
 # How these and what is found are handed to programs and back.
-_KINDS = len(search.KINDS)
+_KINDS = len(KINDS)
 STARTED = (leaf(dtype=np.int32), leaf(), Start(Candidates(leaf(5), leaf(3), leaf(7)), leaf(3, 3), leaf(), leaf()))
 FOUND = search.Found(
     scores=leaf(_KINDS),

@@ -106,6 +106,9 @@ def find_ground(
         camera: Where the points were seen from (3,), or None.
         max_tilt: Largest angle in radians between the plane's normal and `up`: small where gravity is known well.
 
+    Returns:
+        The plane, its normal towards the camera where that is known, and the corners of the patch that was seen.
+
     Raises:
         ValueError: An argument of wrong shape or value.
     """

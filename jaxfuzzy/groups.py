@@ -57,7 +57,7 @@ def by_shapes(
     rests = left_over(members, shapes, taken, parted, least)
     divided = with_left_over(points, members, shapes, rests, fit, least)
     divided |= cut_in_two(points, flat, up, members, shapes, taken.union(divided), fit, least)
-    still = {k: parts for k, parts in rests.items() if k not in divided}
+    still = {k: rest for k, rest in rests.items() if k not in divided}
     divided |= with_left_over(points, members, shapes, still, fit, least, nameless=True)
     if not joined and not divided:
         return parts, shapes

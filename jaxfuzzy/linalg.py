@@ -8,6 +8,9 @@ from jax.scipy.linalg import solve_triangular
 
 from jaxfuzzy.arrays import Array, Float, Int
 
+# Standard deviation of normal errors over the median of their absolute values.
+TO_STD = 1.4826
+
 
 def divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> Array:
     """The quotient, and `fallback` where the denominator is zero; the derivative is zero there, never NaN."""

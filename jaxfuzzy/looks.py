@@ -18,9 +18,11 @@ import numpy as np
 from jaxfuzzy import fitting
 from jaxfuzzy.choice import FLATTEST, FLATTEST_BALL, SLOPES
 from jaxfuzzy.fitting import Fitted
+from jaxfuzzy.linalg import TO_STD
 from jaxfuzzy.objects import DEVIATIONS, PIXELS_PER_POINT, Prepared, about, padded, prepared, with_more
 from jaxfuzzy.polish import Polished
-from jaxfuzzy.search import KINDS, MORE
+from jaxfuzzy.primitives import KINDS
+from jaxfuzzy.search import MORE
 from jaxfuzzy.status import Status
 
 FEWEST = 12
@@ -48,7 +50,6 @@ ABOVE, ABOVE_FLAT, WAVY = 0.8, 1.15, 2.2
 # 1.5, a bust 1.4, pins 1.9. Patches of fewer points are none, and fewer patches say nothing. Depth cameras are so exact that
 # real boxes bulge by more.
 WAVES, WAVES_FLAT, FEWEST_IN_PATCH, FEWEST_PATCHES = 1.1, 1.6, 16, 9
-NORMAL_MEDIAN = 0.6745
 # Just off a surface: up to so many deviations.
 FAR = 6.0
 # Share of points between one and 2.4 given noise distances of the surface, less what uniform outliers explain, from which on it is
@@ -357,7 +358,7 @@ def _waves(look: Look) -> float:
     patch = np.arange(len(near)) * side**2 // len(near)
     mean = np.bincount(patch, residual[near[np.lexsort((down / ahead, column))]]) / np.bincount(patch)
     most = WAVES_FLAT if KINDS[look.fitted.kind] == "plane" else WAVES
-    return float(np.median(np.abs(mean)) / NORMAL_MEDIAN / most / max(1.0, look.fitted.local / SCATTERED))
+    return float(TO_STD * np.median(np.abs(mean)) / most / max(1.0, look.fitted.local / SCATTERED))
 
 
 def _beyond(look: Look) -> float:

@@ -31,8 +31,8 @@ CLEARLY = 2.0
 BLOCKED = 0.5
 
 
-class Sight(NamedTuple):
-    """Some points as the camera sees them.
+class Bundle(NamedTuple):
+    """A bundle of rays: some points as the camera sees them.
 
     Attributes:
         ray: Their directions (n, 3).
@@ -77,19 +77,19 @@ def with_hidden_ends(
         thickness: How far above it points were taken for its own.
     """
     on = [own[np.asarray(shape.inliers)] for own, shape in zip(members, shapes, strict=True)]
-    seen = [_seen_from(camera, points, own) for own in on]
-    sights = [_sight(ray, depth, _reach(ray)) for ray, depth in seen]
+    rays = [_seen_from(camera, points, own) for own in on]
+    bundles = [_bundle(ray, depth, _reach(ray)) for ray, depth in rays]
     rest = np.delete(np.arange(len(points)), np.concatenate([np.zeros(0, int), *on]))
-    outliers = _sight(*_seen_from(camera, points, rest), 0.0)
+    outliers = _bundle(*_seen_from(camera, points, rest), 0.0)
     told = []
     for k, shape in enumerate(shapes):
         # What belongs to no shape may be an occluder too, if it is as dense as what it hides.
-        loose = outliers._replace(reach=sights[k].reach)
-        before = [*(s for i, s in enumerate(sights) if i != k), loose]
+        loose = outliers._replace(reach=bundles[k].reach)
+        before = [*(s for i, s in enumerate(bundles) if i != k), loose]
         hidden = {
             end.extent
             for end in ends_of(shape.primitive)
-            if not _rests(end, ground, thickness) and _hidden(end, shape, sights[k], before, camera)
+            if not _rests(end, ground, thickness) and _hidden(end, shape, bundles[k], before, camera)
         }
         if hidden:
             body = shape.primitive
@@ -123,8 +123,8 @@ def ends_of(body: Primitive | None) -> list[End]:
             corners = np.asarray(body.corners)
             # Each edge with the next one, which leads away from it.
             leads = np.roll(corners, -1, axis=0) - corners
-            lengths = np.linalg.norm(leads, axis=1)
-            return [End(i % 2, corners[i], -leads[i] / max(lengths[i], 1e-12), float(lengths[i])) for i in range(4)]
+            long = np.linalg.norm(leads, axis=1)
+            return [End(i % 2, corners[i], -leads[i] / max(long[i], 1e-12), float(long[i])) for i in range(4)]
     return []
 
 
@@ -144,9 +144,9 @@ def _seen_from(camera: np.ndarray, points: np.ndarray, own: np.ndarray) -> tuple
     return offset / np.maximum(depth, 1e-12)[:, None], depth
 
 
-def _sight(ray: np.ndarray, depth: np.ndarray, reach: float) -> Sight:
+def _bundle(ray: np.ndarray, depth: np.ndarray, reach: float) -> Bundle:
     middle = ray.mean(axis=0) if len(ray) else np.zeros(3)
-    return Sight(ray, depth, reach, middle, float(lengths(ray - middle).max(initial=0.0)))
+    return Bundle(ray, depth, reach, middle, float(lengths(ray - middle).max(initial=0.0)))
 
 
 def _reach(ray: np.ndarray) -> float:
@@ -157,21 +157,21 @@ def _reach(ray: np.ndarray) -> float:
     return float(np.sqrt(np.median(nth_smallest(square, NEIGHBOURS))))
 
 
-def _hidden(end: End, shape: Shape, sight: Sight, before: Sequence[Sight], camera: np.ndarray) -> bool:
-    if sight.reach == 0:
+def _hidden(end: End, shape: Shape, own: Bundle, before: Sequence[Bundle], camera: np.ndarray) -> bool:
+    if own.reach == 0:
         return False
-    surface = sight.ray * sight.depth[:, None]
+    surface = own.ray * own.depth[:, None]
     # How far inside the end each point is.
     inside = (end.place - camera - surface) @ end.outward
-    away = float(np.median(sight.depth))
-    width = max(STRIP * end.length, SPACINGS * sight.reach * away / np.sqrt(NEIGHBOURS))
+    away = float(np.median(own.depth))
+    width = max(STRIP * end.length, SPACINGS * own.reach * away / np.sqrt(NEIGHBOURS))
     asked = np.flatnonzero(inside < width)
     if len(asked) < FEWEST_ASKED:
         return False
     asked = asked[np.linspace(0, len(asked) - 1, min(len(asked), MOST_ASKED)).astype(int)]
     nearer = np.zeros(len(asked), int)
     for other in before:
-        reach = max(sight.reach, other.reach)
+        reach = max(own.reach, other.reach)
         # The surface as far beyond its end as half the strip is wide, or as the other's points tell where it ends.
         step = np.maximum(inside[asked], 0) + max(width / 2, 0.7 * reach * away)
         beyond = _moved(shape.primitive, surface[asked], end, step, camera)

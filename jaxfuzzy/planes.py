@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 
 from jaxfuzzy.arrays import Array, Bool, Float, Int, lengths, on_device, record
-from jaxfuzzy.linalg import normalised, tangents
+from jaxfuzzy.linalg import TO_STD, normalised, tangents
 
 # Patches along each side of the view. 24 leaves a patch of a 450 x 375 image some 19 x 16 pixels: over that, a standing
 # surface runs through a lying plane by several deviations of a stereo match, and a strip of board between cones fills some.
@@ -153,8 +153,8 @@ def fit_plane(view: View, prior: Prior, scale: Float[Array, ""]) -> Candidate:
 
     (normal, offset), _ = lax.scan(finish, (normal, offset), length=6)
     residual = jnp.abs(points @ normal - offset) * lax.rsqrt((rays @ normal) ** 2 + floors**2)
-    # The median of |residual| of a normal deviation of 1 is 0.6745; what is further than 5 belongs to something else.
-    spread = _weighted_median(residual, jnp.where(residual < 5, trust, 0)) / 0.6745
+    # What is further than 5 belongs to something else.
+    spread = TO_STD * _weighted_median(residual, jnp.where(residual < 5, trust, 0))
     support = jnp.where(scores[best] == -jnp.inf, -1, supports[best])
     return Candidate(normal, offset + middle @ normal, support, spread)
 

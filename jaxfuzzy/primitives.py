@@ -300,7 +300,9 @@ class Quadric(_Body):
 
 
 Primitive = Plane | Box | Cylinder | Cone | Sphere | Quadric
-KINDS: dict[str, type[Primitive]] = {c.kind: c for c in (Plane, Box, Cylinder, Cone, Sphere, Quadric)}
+PRIMITIVES: dict[str, type[Primitive]] = {c.kind: c for c in (Plane, Box, Cylinder, Cone, Sphere, Quadric)}
+# Kinds to choose from: a quadric is what is none of them.
+KINDS = tuple(kind for kind in PRIMITIVES if kind != "quadric")
 _SHAPES: dict[str, tuple[int, ...]] = {
     **dict.fromkeys(("point", "normal", "center", "size", "seen", "base", "axis", "apex"), (3,)),
     **dict.fromkeys(("radius", "half_angle"), ()),
@@ -317,7 +319,7 @@ def primitive_from_dict(data: dict[str, Any]) -> Primitive:
     Raises:
         ValueError: if the kind is unknown, or a field is missing, unknown or of the wrong shape.
     """
-    cls = KINDS[checks.choice(data.get("kind"), "kind", tuple(KINDS))]
+    cls = PRIMITIVES[checks.choice(data.get("kind"), "kind", tuple(PRIMITIVES))]
     fields = dataclasses.fields(cls)
     given = {k: v for k, v in data.items() if k != "kind" and v is not None}
     needed = {f.name for f in fields if f.default is dataclasses.MISSING}
@@ -374,7 +376,7 @@ def transform(primitive: Primitive, rotation: Float[ArrayLike, "3 3"], origin: F
                 return Quadric(coefficients)
             corners = place(as_float(bounds)[meshes.CUBE_CORNERS, jnp.arange(3)])
             return Quadric(coefficients, jnp.stack([corners.min(0), corners.max(0)]))
-    raise TypeError(f"primitive must be one of {', '.join(KINDS)}, got {type(primitive).__name__}")
+    raise TypeError(f"primitive must be one of {', '.join(PRIMITIVES)}, got {type(primitive).__name__}")
 
 
 def _to_walls(beyond: Array) -> Array:

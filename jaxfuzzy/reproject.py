@@ -14,6 +14,7 @@ from jaxfuzzy import checks
 from jaxfuzzy.arrays import Array, as_float, on_device
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.linalg import TO_STD
 from jaxfuzzy.rig import Rig
 from jaxfuzzy.status import Status
 
@@ -21,8 +22,6 @@ from jaxfuzzy.status import Status
 # to 560 rows. The left-right residual and local differences understate it two to nine times. Images with more rows are as sharp,
 # not sharper: at 1,500 rows 0.6 px were measured.
 DISPARITY_STD_PX, MEASURED_ROWS = 0.2, 560
-# Standard deviation of normal errors over the median of their absolute values.
-TO_STD = 1.4826
 # Disparities above the width of a picture, or above this, are told.
 NARROWEST_PX = 64
 # A plane is fitted with weights that follow from it, so many times.
@@ -139,6 +138,9 @@ def measure_noise(disparity_px: Any, mask: Any, *, truth_px: Any = None, block: 
         truth_px: True disparities (H, W) in place of a plane.
         block: Side of the blocks, pixels; it must be large against the reach of the correlation.
 
+    Returns:
+        The standard deviation, and how many pixels make one independent point.
+
     Raises:
         ValueError: Shapes disagree, or `block` is less than 2.
         DataError: Fewer than 100 pixels, or fewer than 4 blocks of which half is seen.
@@ -218,6 +220,14 @@ def _map(value: np.ndarray, name: str, rig: Rig) -> np.ndarray:
         raise ValueError(
             f"rig must be rectified, since {name} is that of rectified images: see rectify, or where the rig's file describes raw"
             " cameras too, load_rig(..., rectified=True), --rectified"
+        )
+    if rig.image_size is None and not all(
+        0 <= c <= size for c, size in zip(rig.center_px, value.shape[::-1], strict=True)
+    ):
+        warnings.warn(
+            f"the rig's center, {rig.center_px}, lies outside the {value.shape[1]} x {value.shape[0]} pixels of {name}: if the"
+            " images were resized since, rig.scaled(factor) makes the rig of them",
+            stacklevel=3,
         )
     return value.astype(np.float64 if value.dtype == np.float64 else np.float32)
 

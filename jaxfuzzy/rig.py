@@ -213,6 +213,9 @@ def load_rig(
         arbitrary_units: Where the baseline or offset is not in the file, go on with baseline 1 and offset 0; the rig
             then has `metric=False`, lengths mean nothing and an unknown offset bends shapes.
 
+    Returns:
+        The rig, in metres; one whose file describes raw cameras is not `rectified`.
+
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It is not a rig's file, or does not hold what metres need.

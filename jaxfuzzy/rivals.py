@@ -15,7 +15,7 @@ import numpy as np
 from jaxfuzzy.evidence import TELLS, margin_of, spoken_against
 from jaxfuzzy.objects import PIXELS_PER_POINT
 from jaxfuzzy.outline import Sight, seen_through
-from jaxfuzzy.search import KINDS
+from jaxfuzzy.primitives import KINDS
 from jaxfuzzy.shapes import Shape
 
 # The shapes in some places of the list as other kinds, one each.

@@ -17,7 +17,6 @@ from jaxfuzzy.finalists import finalists
 from jaxfuzzy.rays import View, picked, taken, turned
 from jaxfuzzy.screening import screened
 
-KINDS = ("plane", "box", "cylinder", "cone", "sphere")
 FEW, MORE = 256, 512
 PATCHES = 24
 COARSE = tuple(np.geomspace(4.0, 2.5, 6))

@@ -19,9 +19,8 @@ from jaxfuzzy.fitting import TOLERANCES, Fitted
 from jaxfuzzy.looks import Look, Settings, first_look, further_look, look_about, look_as, side_by_side, unfit
 from jaxfuzzy.mostpoints import most_points
 from jaxfuzzy.objects import DEVIATIONS, MOST, Prepared, capacity_for, prepared
-from jaxfuzzy.primitives import Primitive
+from jaxfuzzy.primitives import KINDS, Primitive
 from jaxfuzzy.quadrics import quadric_of
-from jaxfuzzy.search import KINDS
 from jaxfuzzy.status import Status
 
 # Of these bits a quadric has the first alone.

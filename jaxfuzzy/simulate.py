@@ -12,9 +12,8 @@ import numpy as np
 
 from jaxfuzzy.arrays import record, static
 from jaxfuzzy.bodies import Body, body_of
-from jaxfuzzy.primitives import Primitive
+from jaxfuzzy.primitives import KINDS, Primitive
 
-KINDS = ("plane", "box", "cylinder", "cone", "sphere")
 OTHERS = ("torus", "ellipsoid", "saddle", "blob")
 
 # Wrong matches fill the box around the object, padded by this share of its longest side.

@@ -20,9 +20,10 @@ from jaxfuzzy.arrays import Array, Bool, Float, on_device
 from jaxfuzzy.brightness import UNCHANGED, Line, evened, line_between
 from jaxfuzzy.checks import DataError
 from jaxfuzzy.cloud import Cloud
+from jaxfuzzy.linalg import TO_STD
 from jaxfuzzy.matcher import FURTHEST_PX, STEP, Matcher, chosen
 from jaxfuzzy.photos import Alignment, Image, alignment, grey, read_pair, rectify
-from jaxfuzzy.reproject import TO_STD, cloud_from_disparity, usual_std_px
+from jaxfuzzy.reproject import cloud_from_disparity, usual_std_px
 from jaxfuzzy.rig import Rig, load_rig
 from jaxfuzzy.status import Status, describe
 
@@ -33,9 +34,15 @@ MISALIGNED_PX, ROLLED_PX = 0.75, 1.0  # rows may differ by less without harm, on
 BM_BLOCK = 15  # block matching needs more to tell places apart
 SIXTEENTHS = 16  # OpenCV's fixed point: disparities are int16, 16 a pixel
 COARSE_WIDTH, COARSE_BLOCK = 320, 3  # the disparity range is looked for on images no wider than this, by such blocks
+COARSE_AGREE_PX, COARSE_SPECKLE_PX = 1.0, 20  # of them both directions must agree so well; patches of so few are none
 RANGE_SHARE = 0.002  # share of coarse matches left out at either end of the range
 MISSED_SHARE = 0.1  # of coarse matches outside a range that was given, from which on that is told
 WINDOW_PX, SMOOTHING_PX, LARGEST_STEP_PX = 1.5, 2.0, 0.5  # of the refinement
+ALIKE_PX = 1.0  # its means weigh neighbors by a normal curve of so wide a difference of disparity
+UNLIKE_PX = 8.0  # so far beyond all others that a pixel counts for nothing in them
+TEXTURE_PX = 15  # an image tells something where it is not of one grey over so many pixels in both directions
+STEP_PX = 2  # a larger one between neighbors is a step in depth
+PREFILTER_CAP = 31  # slopes of grey levels count up to so much, so that one strong edge does not outweigh a texture
 # Where noise or compression leaves disparities rough, images are smoothed over so many pixels, among so similar grey levels, and
 # matched once more, and refined by a second step. Rough are those that differ from their smoother neighborhood by more than such a
 # share of their usual deviation: of twelve real scenes as they are 0.14 to 0.24, with noise of 4 grey levels 0.27 to 0.50, as JPEG
@@ -238,8 +245,8 @@ def _coarse(left: Image, right: Image, matcher: Matcher, bottom: float, top: flo
     coarse = dataclasses.replace(matcher, method="sgbm", block=COARSE_BLOCK, smoothness=prices)
     values = _match(one, other, low, count, coarse)
     mirrored = _match(other[:, ::-1], one[:, ::-1], low, count, coarse)[:, ::-1]
-    valid = (values >= low) & _agrees(values, mirrored, low, 1.0) & _textured(small[0])
-    valid = _without_speckles(values, valid, 20)
+    valid = (values >= low) & _agrees(values, mirrored, low, COARSE_AGREE_PX) & _textured(small[0])
+    valid = _without_speckles(values, valid, COARSE_SPECKLE_PX)
     if valid.sum() < FEWEST_POINTS:
         return np.zeros(0), shrink, UNCHANGED
     at = np.flatnonzero(valid)
@@ -269,7 +276,7 @@ def _match(left: Image, right: Image, low: int, count: int, matcher: Matcher) ->
             P1=first,
             P2=second,
             disp12MaxDiff=1,
-            preFilterCap=31,
+            preFilterCap=PREFILTER_CAP,
             uniquenessRatio=matcher.uniqueness,
             mode=MODES[matcher.method],
         )
@@ -286,9 +293,9 @@ def _agrees(values: np.ndarray, mirrored: np.ndarray, low: int, tolerance: float
     return inside & (other >= low) & (np.abs(other - values) <= tolerance)
 
 
-def _textured(image: Image, side: int = 15) -> np.ndarray:
+def _textured(image: Image) -> np.ndarray:
     """Where there is any texture at all near a pixel: what is of one grey (overexposed, say) matches everywhere."""
-    around = np.ones((side, side), np.uint8)
+    around = np.ones((TEXTURE_PX, TEXTURE_PX), np.uint8)
     return cv2.dilate(grey(image), around) != cv2.erode(grey(image), around)
 
 
@@ -303,16 +310,16 @@ def _whole_blocks(values: np.ndarray, matcher: Matcher) -> np.ndarray:
     return inside(columns) & inside(columns - values)
 
 
-def _edges(values: np.ndarray, valid: np.ndarray, radius: int, jump: float = 2.0) -> np.ndarray:
-    """The nearer side of depth edges: pixels with a valid neighbor within `radius` that is `jump` further away."""
+def _edges(values: np.ndarray, valid: np.ndarray, radius: int) -> np.ndarray:
+    """The nearer side of depth edges: pixels with a valid neighbor within `radius` that is a step further away."""
     far = cv2.erode(np.where(valid, values, np.float32(np.inf)), np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))
-    return valid & (values - far > jump)
+    return valid & (values - far > STEP_PX)
 
 
-def _without_speckles(values: np.ndarray, valid: np.ndarray, area: int, jump: int = 2) -> np.ndarray:
+def _without_speckles(values: np.ndarray, valid: np.ndarray, area: int) -> np.ndarray:
     gone = -(2**15) + 1
     fixed = np.where(valid, np.rint(values * SIXTEENTHS), gone).astype(np.int16)
-    cv2.filterSpeckles(fixed, gone, area, jump * SIXTEENTHS)
+    cv2.filterSpeckles(fixed, gone, area, STEP_PX * SIXTEENTHS)
     return valid & (fixed != gone)
 
 
@@ -330,8 +337,8 @@ def _refined(left: Image, right: Image, values: np.ndarray, valid: np.ndarray, r
     here = valid.astype(np.float32)
 
     def mean(values: np.ndarray, reach: float) -> np.ndarray:
-        low = np.float32(values[valid].min() - 8)  # so far away that pixels without a disparity count for nothing
-        return cv2.bilateralFilter(np.where(valid, values, low), -1, 1.0, reach)
+        low = np.float32(values[valid].min() - UNLIKE_PX)
+        return cv2.bilateralFilter(np.where(valid, values, low), -1, ALIKE_PX, reach)
 
     def moved(start: np.ndarray, wide: float, furthest: float) -> np.ndarray:
         share = np.maximum(cv2.GaussianBlur(here, (0, 0), wide), 1e-6)

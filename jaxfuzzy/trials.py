@@ -1,8 +1,8 @@
 """What joining and dividing groups have in common: what is tried, what lies inside what, and what cannot be."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from jaxfuzzy.shapes import Shape
 from jaxfuzzy.status import Status
 
 K = TypeVar("K")
-# Fits shapes to sets of points given by their indices; of shares of larger sets it is told these too, and which sets may be lying.
-Fit = Callable[..., tuple[Shape, ...]]
 
 # Of a group that is part of a round body, this share lies inside it, or outside by so many noise distances; so does this share
 # of the body's own group, of which the second share at least must lie on its surface.
@@ -28,6 +26,26 @@ FEWEST = 60
 TRIED = 4096
 # Cosine from which on an axis is upright.
 UPRIGHT = 0.95
+
+
+class Fit(Protocol):
+    """Fits shapes to sets of points."""
+
+    def __call__(
+        self,
+        sets: Sequence[np.ndarray],
+        wholes: Sequence[np.ndarray] | None = None,
+        further: Sequence[bool] | None = None,
+        /,
+    ) -> tuple[Shape, ...]:
+        """The shape of each set.
+
+        Args:
+            sets: Indices of the points of each.
+            wholes: Of sets that are shares of larger ones these.
+            further: Which of them may be lying; all by default.
+        """
+        ...
 
 
 def contained(points: np.ndarray, members: Sequence[np.ndarray], shapes: Sequence[Shape]) -> dict[int, int]:

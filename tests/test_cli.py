@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import jaxfuzzy.scene
-from jaxfuzzy import cli, plot, report, table, terminal
+from jaxfuzzy import arguments, cli, plot, report, table, terminal
 from jaxfuzzy.matcher import Matcher
+from jaxfuzzy.primitives import KINDS
 from jaxfuzzy.rig import Rig, save_rig
 from synthetic import SCHEMA, empty_scene, make_scene
 
@@ -59,6 +60,11 @@ def three_groups(path="points.csv", names=("width", "depth")):
     points = np.concatenate([rng.normal(middle, 0.1, (count, 2)) for middle, count in groups])
     np.savetxt(path, points, delimiter=",", header=",".join(names), comments="")
     return points
+
+
+def test_kinds_of_the_command_line_are_those_of_the_library():
+    """Said twice, so that help needs no import of JAX."""
+    assert arguments.KINDS == KINDS
 
 
 def last_line(err):

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 import trimesh
 
-from jaxfuzzy.primitives import KINDS, Box, Cone, Cylinder, Plane, Quadric, Sphere, primitive_from_dict, transform
+from jaxfuzzy.primitives import PRIMITIVES, Box, Cone, Cylinder, Plane, Quadric, Sphere, primitive_from_dict, transform
 
 RNG = np.random.default_rng(4)
 
@@ -141,7 +141,7 @@ def test_dict_refused(data, message):
 def test_parameters_have_names_and_finite_derivatives(name):
     body = BODIES[name]
     assert body.parameters().shape == (len(body.parameter_names),)
-    assert set(KINDS) >= {body.kind}
+    assert set(PRIMITIVES) >= {body.kind}
     floats = body if not isinstance(body, Box) else Box(body.center, body.size, body.axes, np.ones(3))
     for leaf in jax.tree.leaves(jax.jit(jax.jacfwd(lambda b: b.parameters()))(floats)):
         assert np.isfinite(leaf).all()

@@ -59,6 +59,7 @@ def test_one_pixel_by_hand():
     assert cloud.status == 0
 
 
+@pytest.mark.filterwarnings("ignore:.*lies outside the 7 x 5 pixels")
 def test_both_cameras_see_the_point_where_it_was():
     """Trap 4 (the sign of Q): projected into both cameras, a point returns to its pixel and to that less its disparity."""
     rig = Rig((700.0, 710.0), (300.0, 200.0), 0.12, None, doffs_px=31.0)
@@ -719,6 +720,8 @@ def test_settings_that_cannot_be(settings, error, says):
     "matcher", [Matcher(method="bm", smoothness=(5, 5000)), Matcher(block=1, smoothness=(5, 5000))]
 )
 def test_prices_of_other_blocks_do_not_reach_the_coarse_look(table, matcher):
+    usual, own = (search_range(table.left, table.right, table.rig, m) for m in (Matcher(), matcher))
+    assert own == usual
     disparity(table.left, table.right, table.rig, matcher=matcher)
 
 
@@ -739,6 +742,13 @@ def test_multiples_of_pixels_are_told_and_millimetres_refused():
             cloud_from_disparity(wrong, None, FLAT)
     with pytest.raises(ValueError, match=r"depth_m must be in metres, got uint16.* multiply by 0\.001"):
         cloud_from_depth((1000 * values).astype(np.uint16), None, FLAT)
+
+
+def test_a_center_outside_the_picture_is_told():
+    """Of pictures a quarter as large as the rig's, where that does not know its size."""
+    values = np.full((2, 4), 8.0)
+    with pytest.warns(UserWarning, match=r"center, \(9\.0, 0\.5\), lies outside the 4 x 2 pixels.*scaled"):
+        cloud_from_disparity(values, None, dataclasses.replace(FLAT, image_size=None, center_px=(9.0, 0.5)))
 
 
 @pytest.mark.parametrize("wrong", [np.nan, 0.0, -0.2])
