@@ -20,7 +20,11 @@ SLOWING = ("OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
 
 def provenance() -> dict[str, Any]:
     """Machine, commit and versions of a run."""
-    git = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=RESULTS.parent)
+    git = lambda *words: subprocess.run(
+        ["git", *words], capture_output=True, text=True, cwd=RESULTS.parent
+    ).stdout.strip()
+    # What was measured is the code: results of earlier runs may wait to be committed.
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/", f":(exclude){RESULTS}")
     cpu = next(
         (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line),
         platform.processor(),
@@ -32,7 +36,7 @@ def provenance() -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             continue
     return {
-        "commit": git.stdout.strip() or "unknown",
+        "commit": (git("rev-parse", "--short", "HEAD") or "unknown") + ("-dirty" if changed else ""),
         "date": time.strftime("%Y-%m-%d"),
         "machine": f"{cpu}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -40,14 +44,17 @@ def provenance() -> dict[str, Any]:
     }
 
 
+def seconds_of(call: Callable[[], Any]) -> float:
+    """Seconds of one call."""
+    begin = time.perf_counter()
+    call()
+    return time.perf_counter() - begin
+
+
 def timings(call: Callable[[], Any], repeats: int = 7) -> dict[str, float]:
     """Seconds of a call: median, fastest and slowest of some repeats after one that does not count."""
     call()
-    seconds = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - begin)
+    seconds = [seconds_of(call) for _ in range(repeats)]
     return {"median": float(np.median(seconds)), "min": min(seconds), "max": max(seconds)}
 
 
