@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxfuzzy as jf
-from jaxfuzzy import scene as scene_module
+from jaxfuzzy import naming
 from jaxfuzzy.primitives import Box, Cylinder, Sphere
 from jaxfuzzy.render import render_pair, table_scene
 from jaxfuzzy.simulate import simulate_scene
@@ -176,7 +176,7 @@ def test_cones_that_stand_are_measured_better(monkeypatch):
         return np.rad2deg([float(s.primitive.half_angle) for s in found.shapes if s.kind == "cone"])
 
     together = half_angle()
-    monkeypatch.setattr(scene_module, "agreed_vertical", lambda *_: None)
+    monkeypatch.setattr(naming, "agreed_vertical", lambda *_: None)
     alone = half_angle()
     assert len(together) == len(alone) == len(truth) == 1
     # By itself it leans by 1.5 and 1.9 degrees.
