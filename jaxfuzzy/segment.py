@@ -27,7 +27,7 @@ COUNTED = 4096
 # A scene too wide for its detail is looked at with a wider bandwidth, one with too few peaks with a narrower one; so many times.
 COARSER, ATTEMPTS = 1.25, 24
 # The spacing is measured at so many points, among so many, by the distance to this neighbour; a low quantile leaves outliers out.
-PROBES, CROWD, NEIGHBOUR, QUANTILE, ALONE = 192, 3072, 8, 0.2, 2.5
+PROBES, AT_A_TIME, CROWD, NEIGHBOUR, QUANTILE, ALONE = 768, 64, 3072, 8, 0.2, 2.5
 
 
 @record
@@ -217,14 +217,18 @@ def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     """From the spacing of the points on their surface and the size of that surface; what lies alone counts as neither."""
     real = np.flatnonzero(w > 0)
     crowd = x[real[:: max(len(real) // (16 * CROWD), 1)]].astype(float)
-    crowd = crowd - crowd.mean(axis=0)
+    crowd = crowd - np.full(len(crowd), 1 / len(crowd)) @ crowd
     # Thinned in an order of the points' own, so that the one they come in does not matter.
-    crowd = crowd[np.argsort((crowd**2).sum(axis=1), kind="stable")]
+    crowd = crowd[np.argsort(np.einsum("ij,ij->i", crowd, crowd))]
     crowd = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), CROWD)).astype(int)]
     probes = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), PROBES)).astype(int)]
     neighbour = min(NEIGHBOUR, len(crowd) - 1)
-    square = (probes**2).sum(axis=1)[:, None] + (crowd**2).sum(axis=1) - 2 * product(probes, crowd.T)
-    reach = np.sqrt(np.maximum(nth_smallest(square, neighbour), 0))
+    # |p - c|² less |p|², one product, few probes at a time so that what is looked at stays at hand.
+    beside = np.concatenate([-2 * crowd.T, np.einsum("ij,ij->i", crowd, crowd)[None]])
+    asked = np.concatenate([probes, np.ones((len(probes), 1))], axis=1)
+    parts = np.array_split(asked, -(-len(asked) // AT_A_TIME))
+    nearest = np.concatenate([nth_smallest(product(part, beside), neighbour) for part in parts])
+    reach = np.sqrt(np.maximum(nearest + np.einsum("ij,ij->i", probes, probes), 0))
     usual = np.quantile(reach, QUANTILE)
     # `neighbour` points within a disc of this radius: so much surface has each of the points that lie on a surface.
     area = np.pi * usual**2 / max(neighbour, 1) * (reach <= ALONE * usual).mean() * len(crowd)
