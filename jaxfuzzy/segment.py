@@ -19,7 +19,7 @@ from jaxfuzzy.validity import ClusterCount, choose_k
 # "auto" allows so many objects.
 MOST = 20
 # Bandwidth over (spacing² · size)^(1/3), spacing that of the points on their surface, size that of the surface.
-BANDWIDTH = 1.95
+BANDWIDTH = 2.025
 # Points are gathered in cells of half the bandwidth; numbers of cells that are compiled.
 CAPACITIES = (1024, 2048, 4096)
 # A cloud counts for no more points than this: of a dense one, neighbours are not independent.
