@@ -96,10 +96,10 @@ def named(seen: Seen, own: np.ndarray, parts: Segmentation, rule: str, regroup: 
         if seen.pixels is not None and camera is not None:
             parts, shapes = by_steps(points, parts, shapes, tried.fit, tried.stepped, tried.least)
     members = members_of(parts)
-    shapes = _weighed(seen, own, members, shapes, sight, tried)
+    shapes = _weighed(tried, members, shapes)
     up = seen.up
     if rule != "paper":
-        shapes, up = _upright(seen, members, shapes, tried)
+        shapes, up = _upright(tried, members, shapes)
         shapes = level_patches(points, members, shapes, np.asarray(up, float), camera)
     shapes = with_quadrics(points, members, shapes, seen.of(own)["weights"])
     if camera is not None:
@@ -160,19 +160,13 @@ class _Tried:
         return shapes if self.seen.pixels is None else in_independent_points(shapes, OF_SCENE)
 
 
-def _weighed(
-    seen: Seen,
-    own: np.ndarray,
-    members: list[np.ndarray],
-    shapes: tuple[Shape, ...],
-    sight: Sight | None,
-    tried: _Tried,
-) -> tuple[Shape, ...]:
+def _weighed(tried: _Tried, members: list[np.ndarray], shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
     """Shapes by the evidence of independent points and by what is seen past their outlines."""
+    seen, sight = tried.seen, tried.sight
     shapes = tried.independent(shapes)
     if sight is None:
         return shapes
-    mine = [own[m] for m in members]
+    mine = [tried.own[m] for m in members]
     if seen.pixels is not None:
         again = lambda of, kinds: tried.as_kinds([members[i] for i in of], kinds)
         shapes = chosen_by_outline(seen.points, mine, shapes, sight, again)
@@ -183,11 +177,11 @@ def _weighed(
 
 
 def _upright(
-    seen: Seen, members: list[np.ndarray], shapes: tuple[Shape, ...], tried: _Tried
+    tried: _Tried, members: list[np.ndarray], shapes: tuple[Shape, ...]
 ) -> tuple[tuple[Shape, ...], np.ndarray]:
-    """The vertical that the objects agree on, and those that stand upright fitted once more about it."""
-    correlated = seen.pixels is not None
-    axis = np.asarray(seen.up, float)
+    """The objects, those that stand upright fitted once more about the vertical that all agree on, and that (3,)."""
+    seen = tried.seen
+    axis, correlated = np.asarray(seen.up, float), seen.pixels is not None
     witness = witness_of(seen.points, seen.ground, axis, given=seen.up_given, camera=seen.camera, correlated=correlated)
     agreed = agreed_vertical(shapes, witness)
     if agreed is None:
