@@ -248,7 +248,7 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("rig.json"),
         metavar="FILE",
-        help="where to write the rig: .json (default: rig.json), .yml, .xml for OpenCV, .txt as Middlebury",
+        help="where to write the rig: .json (default: rig.json), or .yml or .xml as OpenCV does",
     )
 
 

@@ -226,7 +226,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     from jaxfuzzy.rigwriters import check_suffix, own_tree
 
     _check_file(args.out, *args.left, *args.right)
-    check_suffix(args.out.suffix.lower(), "out")
+    check_suffix(args.out.suffix.lower(), "out", rectified=False)
     board = {"board": args.board, "square_m": args.square, "marker_m": args.marker, "dictionary": args.dictionary}
     with Progress(args.quiet) as progress:
         progress("looking for the board", 0.0)

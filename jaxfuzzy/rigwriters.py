@@ -22,16 +22,18 @@ def written(fields: Fields, suffix: str) -> str:
     Raises:
         ValueError: No format that is known here has this suffix, or it cannot hold this rig.
     """
-    check_suffix(suffix)
+    check_suffix(suffix, rectified="rotation" not in fields)
     if suffix != ".json" and not fields["metric"]:
         raise ValueError(f"path must end in .json for a rig in arbitrary units, which {suffix} files cannot tell")
     return WRITERS[suffix](fields)
 
 
-def check_suffix(suffix: str, name: str = "path") -> None:
-    """Whether some format has it."""
-    if suffix not in WRITERS:
-        raise ValueError(f"{name} must end in one of {', '.join(WRITERS)}, got {suffix or 'no suffix'}")
+def check_suffix(suffix: str, name: str = "path", *, rectified: bool) -> None:
+    """Whether some format has it that can hold a rig which is rectified, or is not."""
+    able = [known for known in WRITERS if rectified or known not in RECTIFIED_ALONE]
+    if suffix not in able:
+        whose = "" if rectified else " for cameras that are not rectified"
+        raise ValueError(f"{name} must end in one of {', '.join(able)}{whose}, got {suffix or 'no suffix'}")
 
 
 def own_tree(fields: Fields) -> dict[str, Any]:
@@ -80,10 +82,6 @@ def _storage(kind: str) -> Callable[[Fields], str]:
 
 
 def _middlebury(fields: Fields) -> str:
-    if "rotation" in fields:
-        raise ValueError(
-            "path must end in .json, .yml, .yaml or .xml for cameras that are not rectified: rectify first"
-        )
     (fx, fy), (x, y), doffs = fields["focal_px"], fields["center_px"], fields["doffs_px"]
     lines = [f"cam{i}=[{fx!r} 0 {column!r}; 0 {fy!r} {y!r}; 0 0 1]" for i, column in enumerate((x, x + doffs))]
     lines += [f"doffs={doffs!r}", f"baseline={1e3 * fields['baseline_m']!r}"]
@@ -105,3 +103,4 @@ WRITERS: dict[str, Callable[[Fields], str]] = {
     ".xml": _storage(".xml"),
     ".txt": _middlebury,
 }
+RECTIFIED_ALONE = (".txt",)

@@ -490,7 +490,8 @@ def test_bad_calibration(run, tmp_path):
         ((*pair, "--board", "9"), 2, "must be inner corners such as 9x6, got '9'"),
         ((*pair, "--out", "nowhere/rig.json"), 2, "out must be in an existing folder"),
         ((*pair, "--out", "."), 2, "out must be a file, got the folder ."),
-        ((*pair, "--out", "rig.pdf"), 2, "out must end in one of .json, .yml, .yaml, .xml, .txt, got .pdf"),
+        ((*pair, "--out", "rig.pdf"), 2, "out must end in one of .json, .yml, .yaml, .xml for cameras"),
+        ((*pair, "--out", "rig.txt"), 2, "that are not rectified, got .txt"),
         (("missing.png", "--right", "right.png", "--square", "0.02"), 2, "missing.png"),
         (pair, 1, "was found in 0 of 1 pairs"),
     ):
