@@ -253,7 +253,10 @@ def parse_text(data: bytes) -> Columns:
     """
     if b"\0" in data[:LONGEST_HEADER]:
         raise ValueError("is in no known format (PLY, PCD, NPY, NPZ, CSV, XYZ)")
-    rows = [row for line in data.decode("utf-8", "replace").splitlines() if (row := line.split("#")[0].strip())]
+    # Rows of delimiters alone hold nothing either.
+    rows = [
+        row for line in data.decode("utf-8", "replace").splitlines() if (row := line.split("#")[0].strip()).strip(" ,;")
+    ]
     if not rows:
         raise ValueError("holds no points")
     delimiter = next((mark for mark in ",;" if any(mark in row for row in rows[:2])), None)

@@ -175,7 +175,7 @@ def _map(path: str | os.PathLike[str], scale: float, what: str) -> np.ndarray:
 
 
 def _pfm(data: bytes) -> np.ndarray:
-    between = rb"(?:\s+|#[^\n]*\n)+"
+    between = rb"(?:\s|#[^\n]*\n)+"
     head = re.match(
         rb"Pf" + between + rb"(\d+)" + between + rb"(\d+)" + between + rb"([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?:\r\n|\s)",
         data,

@@ -351,6 +351,8 @@ PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\
         (npy(np.zeros((2, 3)))[:-8], "damaged, cut short"),
         (lying_npy(), "damaged, cut short"),
         (b"PK\x03\x04 not a zip", "damaged, cut short"),
+        (b",\n,\n", "holds no points"),
+        (b",", "holds no points"),
     ],
 )
 def test_damaged_files_are_one_sentence(tmp_path, data, says):

@@ -793,6 +793,7 @@ def test_encodings_of_ready_disparities(tmp_path):
         (b"Pf\n3 2\n-1\n" + bytes(25), "longer than it says: 3 x 2"),
         (b"Pf\n3 2\n0\n" + bytes(24), "not a PFM file of one channel"),
         (b"Pf\n3 2\n-e\n" + bytes(24), "not a PFM file of one channel"),
+        (b"Pf" + b" " * 100_000 + b"x", "not a PFM file of one channel"),
         (b"hello", "no image, PFM, NPY or NPZ"),
         (b"PK\x03\x04", "disparity"),
     ],
