@@ -217,7 +217,8 @@ def _bandwidth(x: np.ndarray, w: np.ndarray) -> float:
     """From the spacing of the points on their surface and the size of that surface; what lies alone counts as neither."""
     real = np.flatnonzero(w > 0)
     crowd = x[real[:: max(len(real) // (16 * CROWD), 1)]].astype(float)
-    crowd = crowd - np.full(len(crowd), 1 / len(crowd)) @ crowd
+    crowd = crowd - crowd[0]  # points that are all one are now zero, to the last digit
+    crowd = crowd - np.ones(len(crowd)) @ crowd / len(crowd)
     # Thinned in an order of the points' own, so that the one they come in does not matter.
     crowd = crowd[np.argsort(np.einsum("ij,ij->i", crowd, crowd))]
     crowd = crowd[np.linspace(0, len(crowd) - 1, min(len(crowd), CROWD)).astype(int)]

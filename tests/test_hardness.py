@@ -265,7 +265,7 @@ def test_a_fuzzifier_that_single_precision_cannot_hold_is_refused(m):
             call()
 
 
-@pytest.mark.parametrize("value", [0.0, 3.0])
+@pytest.mark.parametrize("value", [0.0, 3.0, 0.1])
 def test_points_that_are_all_one_are_one_object(value):
     found = jf.segment(np.full((120, 3), value, np.float32))
     assert int(found.k) == 1
