@@ -143,5 +143,5 @@ def nth_smallest(values: np.ndarray, n: int) -> np.ndarray:
 
 
 def extents(rows: np.ndarray) -> np.ndarray:
-    """How far each column of an array (N, D) extends; NumPy takes ten times as long over all columns at once."""
+    """How far each column of an array (N, D) extends; over all columns at once NumPy takes ten times as long to find least ones."""
     return np.array([np.ptp(column) for column in rows.T])

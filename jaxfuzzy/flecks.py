@@ -28,7 +28,7 @@ def in_flecks(pixels: np.ndarray, kept: np.ndarray, fewest: int) -> np.ndarray:
         return np.zeros(len(pixels), bool)
     # In cells of so many pixels, with those around: that is quicker than to grow every pixel.
     cell = np.ceil(GAP * np.sqrt(each))
-    column, row = ((pixels - pixels.min(axis=0)) / cell).astype(int).T
+    column, row = (((along - along.min()) / cell).astype(int) for along in pixels.T)
     mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
     mask[row[kept], column[kept]] = 1
     count, piece = cv2.connectedComponents(mask, connectivity=8)

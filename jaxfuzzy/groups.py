@@ -183,7 +183,7 @@ def _rebuilt(
             # What has no label of its own stays with the first.
             memberships[own, i], memberships[own, siblings[0]] = u[own, k], 0
         size.append(share * sizes[sources].sum())
-        centers.append(points[own].mean(axis=0))
+        centers.append(np.array([along[own].mean() for along in points.T]))
     if into:
         rows = np.flatnonzero(spare)
         own, loose = rows[labels[rows] >= 0], rows[labels[rows] < 0]

@@ -172,7 +172,8 @@ def _along_curve(points: np.ndarray) -> np.ndarray:
     wide = extent >= EDGE_ON * extent.max()
     axes = [0, 1] if wide[:2].all() else np.sort(np.argsort(~wide, kind="stable")[:2])
     flat, extent = points[:, axes], np.maximum(extent[axes], max(EDGE_ON * extent.max(), np.finfo(points.dtype).tiny))
-    bits = ((flat - flat.min(axis=0)) / extent * PLACES).astype(np.uint32)
+    least = [along.min() for along in flat.T]
+    bits = ((flat - least) / extent * PLACES).astype(np.uint32)
     for shift, mask in SHIFTS:
         bits = (bits | bits << shift) & mask
     return np.asarray(bits[:, 0] | bits[:, 1] << 1)

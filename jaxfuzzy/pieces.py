@@ -46,7 +46,7 @@ def without_pieces(
     """
     if not pixels_a_point(pixels) <= SPARSE:
         return tuple(shapes)
-    column, row = np.round(pixels - pixels.min(axis=0)).astype(int).T + STEP
+    column, row = (np.round(along - along.min()).astype(int) + STEP for along in pixels.T)
     point = np.full((row.max() + STEP + 1, column.max() + STEP + 1), -1)
     point[row, column] = np.arange(len(pixels))
     owner = np.full(len(pixels), -1)

@@ -187,7 +187,7 @@ def _sizes(
     held = np.maximum(mass, np.finfo(float).tiny)
     mean = np.stack([total(w * x[:, i]) for i in range(3)], axis=1) / held[:, None]
     middle = np.stack([total(w * flat[:, i]) for i in (0, 1)], axis=1) / held[:, None]
-    within = total(w * ((flat - middle[cell]) ** 2).sum(axis=1))
+    within = total(w * sum((flat[:, i] - middle[cell, i]) ** 2 for i in (0, 1)))
     square = u.astype(float) ** 2
     pull = mass[:, None] * square
     share = pull / np.maximum(pull.sum(axis=0), np.finfo(float).tiny)

@@ -23,7 +23,7 @@ def between_steps(pixels: np.ndarray, depth: np.ndarray, noise: float, each: flo
         return []
     # In cells of so many pixels, each as deep as one of its points: gaps of single pixels part nothing.
     cell = np.ceil(GAP * np.sqrt(each))
-    column, row = ((pixels - pixels.min(axis=0)) / cell).astype(int).T
+    column, row = (((along - along.min()) / cell).astype(int) for along in pixels.T)
     deep = np.full((row.max() + 1, column.max() + 1), np.inf)
     deep[row, column] = depth
     # Cells, and between them what joins them, as a picture of twice the size.
