@@ -172,6 +172,12 @@ def _model(command: argparse.ArgumentParser) -> None:
         help="what that file's numbers are divided by, such as 1000 for millimetres (default: 1)",
     )
     add(
+        "--depth-std",
+        type=_length,
+        metavar="M",
+        help="standard deviation of those depths in metres (default: the rig's stereo error, or what the scene shows)",
+    )
+    add(
         "--min-disparity",
         type=int,
         metavar="N",

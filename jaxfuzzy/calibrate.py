@@ -76,7 +76,7 @@ def calibrate(
     )
     if len(left_images) != len(right_images):
         raise ValueError(f"left_images and right_images must be pairs, got {len(left_images)} and {len(right_images)}")
-    if np.shape(board) != (2,):
+    if checks.real(board, "board").shape != (2,):
         raise ValueError(f"board must be two numbers of inner corners, got {board}")
     for side in board:
         checks.integer(side, "board", at_least=3)

@@ -43,19 +43,26 @@ def places(value: Any, name: str = "points") -> Array:
     if is_concrete(array):
         known = np.asarray(array)
         largest, extent = float(np.abs(known).max()), float(extents(known).max())
-        spacing = largest * float(np.finfo(known.dtype).eps)
-        if spacing > COARSEST * extent > 0:
-            raise ValueError(
-                f"{name} lie up to {largest:g} from the origin and extend over {extent:g}, and {known.dtype} tells them apart by"
-                f" {spacing:.2g}, which is too little: subtract an offset from them, or compute in double precision"
-                " (JAX_ENABLE_X64=1)"
-            )
         if largest > FARTHEST or 0 < extent < SMALLEST:
             raise ValueError(
                 f"{name} must lie within {FARTHEST:g} of the origin and extend over at least {SMALLEST:g}, got {largest:g} and"
                 f" {extent:g}: give them in another unit"
             )
     return array
+
+
+def scene_points(value: Any, name: str = "points") -> np.ndarray:
+    """Points (N, 3) of a whole scene, on the host, that their precision tells apart. Of a part of a scene that is not asked."""
+    known = np.asarray(places(value, name))
+    largest, extent = float(np.abs(known).max()), float(extents(known).max())
+    spacing = largest * float(np.finfo(known.dtype).eps)
+    if spacing > COARSEST * extent > 0:
+        raise ValueError(
+            f"{name} lie up to {largest:g} from the origin and extend over {extent:g}, and {known.dtype} tells them apart by"
+            f" {spacing:.2g}, which is too little: subtract an offset from them, or compute in double precision"
+            " (JAX_ENABLE_X64=1)"
+        )
+    return known
 
 
 def weights(value: Any, count: int, name: str = "weights") -> Array | None:

@@ -94,6 +94,8 @@ def _model(args: argparse.Namespace) -> int:
         given["disparity_px"] = read_disparity(args.disparity, scale=args.disparity_scale)
     if args.depth is not None:
         given["depth_m"] = read_depth(args.depth, scale=args.depth_scale)
+    if args.depth_std is not None:
+        given["depth_std"] = args.depth_std
     if args.min_disparity is not None or args.disparities is not None:
         given["matcher"] = Matcher(min_disparity=args.min_disparity, disparities=args.disparities)
     return _scene(args, lambda **options: _modelling().model_scene(args.left, args.right, rig, **given, **options))

@@ -48,7 +48,7 @@ def check_cloud(cloud: Any) -> np.ndarray:
         ValueError: A field has another shape, or holds what cannot be.
     """
     checks.kind(cloud, "cloud", Cloud, "Cloud(points) makes one, read_cloud reads one")
-    points = np.asarray(checks.places(cloud.points, "cloud.points"))
+    points = checks.scene_points(cloud.points, "cloud.points")
     for name, width in (("colors", 3), ("pixels_px", 2)):
         if (value := getattr(cloud, name)) is None:
             continue
@@ -61,6 +61,8 @@ def check_cloud(cloud: Any) -> np.ndarray:
             raise ValueError(
                 f"cloud.pixels_px must be the column and row of each point, got {array[0].tolist()} for all"
             )
+    if cloud.depth_std is not None:
+        checks.noise_distance(cloud.depth_std, len(points), "cloud.depth_std")
     return points
 
 
@@ -92,7 +94,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         finite = np.isfinite(np.stack([*points.T, *beside.values()])).all(axis=0)
         if not finite.any():
             raise ValueError(f"holds no finite point, out of {len(points)}")
-        checks.places(points[finite])
+        checks.scene_points(points[finite])
     except ValueError as error:
         raise ValueError(f"cloud {os.fspath(path)} {one_line(error)}") from None
     if not finite.all():

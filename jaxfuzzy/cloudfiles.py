@@ -232,7 +232,7 @@ def parse_numpy(data: bytes) -> Columns:
     colors = next((arrays[other] for other in ("colors", "rgb") if other in arrays), None)
     # With or without an opacity.
     if colors is not None and colors.shape[-1:] in ((3,), (4,)) and colors.size == colors.shape[-1] * len(flat):
-        columns |= dict(zip(("red", "green", "blue"), colors.reshape(len(flat), -1).T[:3], strict=True))
+        columns |= dict(zip(("red", "green", "blue"), colors.reshape(-1, colors.shape[-1]).T[:3], strict=True))
     if "pixels_px" in arrays and arrays["pixels_px"].shape == (len(flat), 2):
         columns |= dict(zip(("column_px", "row_px"), arrays["pixels_px"].T, strict=True))
     for other, values in arrays.items():
@@ -291,7 +291,12 @@ def _unnamed(table: np.ndarray) -> Columns:
     """Columns of rows (N, 3 or more) without names: x, y, z, and a color where three others look like one."""
     columns: Columns = dict(zip("xyz", table.T[:3], strict=True))
     rest = table[:, 3:6]
-    if table.shape[1] == 6 and np.all((rest >= 0) & (rest <= 255) & (rest == np.round(rest))) and rest.max() > 1:
+    if (
+        rest.size
+        and table.shape[1] == 6
+        and np.all((rest >= 0) & (rest <= 255) & (rest == np.round(rest)))
+        and rest.max() > 1
+    ):
         columns |= dict(zip(("red", "green", "blue"), rest.T.astype(np.uint8), strict=True))
     return columns
 

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import numpy as np
-
 from jaxfuzzy import checks
 
 METHODS = ("sgbm", "hh", "bm")
@@ -69,7 +67,7 @@ class Matcher:
         checks.integer(self.block, f"block with method={self.method!r}", at_least=1, at_most=largest)
         if self.block % 2 == 0:
             raise ValueError(f"block must be odd, got {self.block}")
-        if np.shape(self.smoothness) != (2,) or not 0 < self.smoothness[0] < self.smoothness[1]:
+        if checks.real(self.smoothness, "smoothness").shape != (2,) or not 0 < self.smoothness[0] < self.smoothness[1]:
             raise ValueError(f"smoothness must be two prices, 0 < first < second, got {self.smoothness}")
         highest = HIGHEST_PRICE / (CHANNELS * self.block**2)
         if self.method != "bm" and not self.smoothness[1] <= highest:

@@ -168,6 +168,10 @@ def _map(path: str | os.PathLike[str], scale: float, what: str) -> np.ndarray:
             raise ValueError(f"must hold one number a pixel, got {values.dtype} {values.shape}")
         if what == "disparity" and values.dtype.kind == "i" and values.dtype.itemsize == 2 and scale == 1:
             raise ValueError("holds int16, which is OpenCV's fixed point: give scale=16, or --disparity-scale 16")
+        if what == "depth" and values.dtype.kind in "iu" and scale == 1:
+            raise ValueError(
+                f"holds {values.dtype}, as depth cameras give millimetres: give scale=1000, or --depth-scale 1000"
+            )
     except ValueError as error:
         raise ValueError(f"{what} {os.fspath(path)} {one_line(error)}") from None
     known = np.isfinite(values) & ((values > 0) if is_image or values.dtype.kind != "f" else True)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfuzzy import checks, meshes
-from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, as_float, on_host, record
+from jaxfuzzy.arrays import Array, ArrayLike, Bool, Float, Int, as_float, on_device, record
 from jaxfuzzy.linalg import divide, norm, normalised, tangents
 
 Vertices = Float[Array, "V 3"]
@@ -88,13 +88,13 @@ class Box(_Body):
         size: Full edge lengths along the rows of `axes`.
         axes: Unit vectors, one a row.
         seen: Whether each edge was seen to its end; where False its length is a lower bound. `model_cloud` tells, which knows
-            what stands before it; elsewhere nothing is known to hide it.
+            what stands before it; elsewhere nothing is known to hide it, which is the default for a single box.
     """
 
     center: Float[Array, "3"]
     size: Float[Array, "3"]
     axes: Float[Array, "3 3"]
-    seen: Bool[Array, "3"] = dataclasses.field(default_factory=lambda: on_host(np.ones(3, bool)))
+    seen: Bool[Array, "3"] = dataclasses.field(default_factory=lambda: on_device(np.ones(3, bool)))
 
     kind: ClassVar[str] = "box"
     parameter_names: ClassVar[tuple[str, ...]] = (
@@ -322,7 +322,7 @@ def primitive_from_dict(data: dict[str, Any]) -> Primitive:
     cls = PRIMITIVES[checks.choice(data.get("kind"), "kind", tuple(PRIMITIVES))]
     fields = dataclasses.fields(cls)
     given = {k: v for k, v in data.items() if k != "kind" and v is not None}
-    needed = {f.name for f in fields if f.default is dataclasses.MISSING}
+    needed = {f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING}
     if not needed <= set(given) <= {f.name for f in fields}:
         raise ValueError(
             f"a {cls.kind} must have the fields {', '.join(f.name for f in fields)}, got {', '.join(given)}"

@@ -76,7 +76,8 @@ def cloud_from_disparity(
     depth = np.full_like(disparity, np.nan)
     depth[valid] = scale / (disparity[valid] + np.asarray(rig.doffs_px, disparity.dtype))
     std_px = usual_std_px(len(disparity)) if disparity_std_px is None else disparity_std_px
-    return _cloud(depth, valid, rig, image, _std(std_px, disparity, valid) * depth**2 / scale)
+    cloud = _cloud(depth, valid, rig, image, _std(std_px, disparity, valid) * depth**2 / scale)
+    return cloud if rig.metric else dataclasses.replace(cloud, status=int(Status.ARBITRARY_UNITS))
 
 
 def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, depth_std: Any = None) -> Cloud:
@@ -87,10 +88,11 @@ def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, d
         valid: Which pixels to use (H, W), or None for all that are known.
         rig: The rig of the image; of a single camera only focal lengths and center matter.
         image: The image for colors, grey (H, W) or BGR (H, W, 3), uint8.
-        depth_std: Standard deviation of the depth, one number or a map (H, W); None takes the rig's stereo error.
+        depth_std: Standard deviation of the depth, one number or a map (H, W); None takes the rig's stereo error, or where its
+            baseline is not known leaves it open.
 
     Returns:
-        The points in row order of their pixels, with colors, `depth_std` and `pixels_px`.
+        The points in metres, in row order of their pixels, with colors, `pixels_px`, and `depth_std` where that is known.
 
     Raises:
         ValueError: Shapes disagree, depths are whole numbers, or a standard deviation is not above 0.
@@ -104,10 +106,11 @@ def cloud_from_depth(depth_m: Any, valid: Any, rig: Rig, *, image: Any = None, d
     depth = _map(values, "depth_m", rig)
     known = np.isfinite(depth) & (depth > 0)
     valid = known if valid is None else _mask(valid, depth.shape) & known
-    if depth_std is None:
-        std = usual_std_px(len(depth)) * depth**2 / (rig.focal_px[0] * rig.baseline_m)
-    else:
+    std = None
+    if depth_std is not None:
         std = np.broadcast_to(_std(depth_std, depth, valid, "depth_std"), depth.shape)
+    elif rig.metric:
+        std = usual_std_px(len(depth)) * depth**2 / (rig.focal_px[0] * rig.baseline_m)
     return _cloud(depth, valid, rig, image, std)
 
 
@@ -146,7 +149,9 @@ def measure_noise(disparity_px: Any, mask: Any, *, truth_px: Any = None, block: 
         DataError: Fewer than 100 pixels, or fewer than 4 blocks of which half is seen.
     """
     checks.integer(block, "block", at_least=2)
-    values = np.asarray(disparity_px, float)
+    values = np.asarray(checks.real(disparity_px, "disparity_px"), float)
+    if values.ndim != 2:
+        raise ValueError(f"disparity_px must have shape (H, W), got {values.shape}")
     mask = _mask(mask, values.shape, "mask") & np.isfinite(values)
     if truth_px is not None and np.shape(truth_px) != values.shape:
         raise ValueError(f"truth_px must have the shape of disparity_px, {values.shape}, got {np.shape(truth_px)}")
@@ -179,7 +184,7 @@ def measure_noise(disparity_px: Any, mask: Any, *, truth_px: Any = None, block: 
     return Noise(std, max(1.0, float(spread / of_one)) if of_one > 0 else 1.0)
 
 
-def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.ndarray) -> Cloud:
+def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.ndarray | None) -> Cloud:
     rows, columns = np.nonzero(valid)
     if not len(rows):
         raise DataError(
@@ -193,9 +198,8 @@ def _cloud(depth: np.ndarray, valid: np.ndarray, rig: Rig, image: Any, std: np.n
     return Cloud(
         points=as_float(points),
         colors=None if image is None else _colors(image, valid),
-        depth_std=as_float(std[valid].astype(dtype)),
+        depth_std=None if std is None else as_float(std[valid].astype(dtype)),
         pixels_px=as_float(np.stack([columns.astype(dtype), rows.astype(dtype)], axis=1)),
-        status=0 if rig.metric else int(Status.ARBITRARY_UNITS),
     )
 
 

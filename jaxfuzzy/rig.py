@@ -136,7 +136,7 @@ class Rig:
             ValueError: The factor is not above 0, a size is not of whole pixels, or the rig does not know its own.
         """
         if np.ndim(to) == 0:
-            sx = sy = _vector([to], "to", 1, positive=True)[0]
+            sx = sy = float(checks.number(to, "to", above=0.0))
             size = None if self.image_size is None else (round(self.image_size[0] * sx), round(self.image_size[1] * sy))
         else:
             width, height = _vector(to, "to", 2, positive=True)
@@ -211,7 +211,8 @@ def load_rig(
         rectified: The images are rectified already although the file also describes the raw cameras.
         cameras: Which two of KITTI's four, such as (0, 1); by default the colour pair (2, 3), else the grey one (0, 1).
         arbitrary_units: Where the baseline or offset is not in the file, go on with baseline 1 and offset 0; the rig
-            then has `metric=False`, lengths mean nothing and an unknown offset bends shapes.
+            then has `metric=False`, lengths mean nothing and an unknown offset bends shapes. The file of a single camera will do
+            then, whose depths are metres all the same where a depth camera gives them.
 
     Returns:
         The rig, in metres; one whose file describes raw cameras is not `rectified`.
@@ -235,7 +236,7 @@ def load_rig(
             rig = _in_metres(_from_json(text), unit)
         else:
             second = None if other is None else _text(other)
-            fields = rigfiles.parse(text, second, cameras=cameras, rectified=rectified)
+            fields = rigfiles.parse(text, second, cameras=cameras, rectified=rectified, alone=arbitrary_units)
             of_format = fields.pop("unit_m", 1.0)
             unit = of_format if unit is None else unit
             rig = _from_fields(fields, unit, arbitrary_units)
@@ -263,9 +264,9 @@ def save_rig(path: str | os.PathLike[str], rig: Rig) -> None:
     """Writes a rig, whole or not at all, in the format that the name ends in.
 
     Args:
-        path: A file ending in `.json`, this library's own, which alone holds everything; in `.yml`, `.yaml` or `.xml`, OpenCV's
-            FileStorage, with M1, D1, M2, D2, R and T, or P1, P2 and Q of rectified cameras; or in `.txt`, Middlebury's
-            `calib.txt` (lengths in millimetres) of rectified ones.
+        path: A file ending in `.json` or in nothing, this library's own, which alone holds everything; in `.yml`, `.yaml` or
+            `.xml`, OpenCV's FileStorage, with M1, D1, M2, D2, R and T, or P1, P2 and Q of rectified cameras; or in `.txt`,
+            Middlebury's `calib.txt` (lengths in millimetres) of rectified ones.
         rig: The rig.
 
     Raises:

@@ -17,7 +17,7 @@ Fields = dict[str, Any]
 
 # Names that people give to the same matrix in OpenCV files, lower case without underscores.
 ALIASES = {
-    "m1": "m1 k1 cameramatrix1 cameramatrixleft leftcameramatrix mtx1 mtxl kl kleft leftk intrinsicsleft",
+    "m1": "m1 k1 cameramatrix cameramatrix1 cameramatrixleft leftcameramatrix mtx1 mtxl kl kleft leftk intrinsicsleft",
     "m2": "m2 k2 cameramatrix2 cameramatrixright rightcameramatrix mtx2 mtxr kr kright rightk intrinsicsright",
     "d1": "d1 distcoeffs1 distortioncoefficients1 distcoeffsleft leftdistcoeffs dist1 distl dleft distortionleft",
     "d2": "d2 distcoeffs2 distortioncoefficients2 distcoeffsright rightdistcoeffs dist2 distr dright distortionright",
@@ -32,8 +32,17 @@ ALIKE_PX = 0.5
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
-def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rectified: bool) -> Fields:
-    """The fields of a rig in one of the known formats; `other` is the text of a second file of the same rig.
+def parse(
+    text: str, other: str | None, *, cameras: tuple[int, int] | None, rectified: bool, alone: bool = False
+) -> Fields:
+    """The fields of a rig in one of the known formats.
+
+    Args:
+        text: The text of the file.
+        other: That of a second file of the same rig.
+        cameras: Which two of KITTI's.
+        rectified: Whether the images are rectified though the file describes the raw cameras too.
+        alone: Whether one camera will do, without a baseline.
 
     Raises:
         ValueError: The text is in no known format, or what is there contradicts itself.
@@ -55,8 +64,8 @@ def parse(text: str, other: str | None, *, cameras: tuple[int, int] | None, rect
     if other is None and isinstance(tree.get("left"), dict) and isinstance(tree.get("right"), dict):
         tree, other_tree = tree["left"], tree["right"]
     if _is_camera_info(tree):
-        return ros(tree, other_tree, rectified=rectified)
-    return opencv(tree | (other_tree or {}), rectified=rectified)
+        return ros(tree, other_tree, rectified=rectified, alone=alone)
+    return opencv(tree | (other_tree or {}), rectified=rectified, alone=alone)
 
 
 def middlebury(text: str) -> Fields:
@@ -116,7 +125,7 @@ def _projection(text: str, name: str) -> np.ndarray:
     return np.reshape([float(word) for word in words], (3, 4))
 
 
-def opencv(tree: Fields, *, rectified: bool) -> Fields:
+def opencv(tree: Fields, *, rectified: bool, alone: bool = False) -> Fields:
     """What OpenCV's stereo calibration sample and its many descendants write: M1 D1 M2 D2 R T and P1 P2 Q."""
     plain = {re.sub(r"[_\-\s]", "", name).lower(): value for name, value in tree.items()}
     found = {key: plain[name] for key, names in ALIASES.items() for name in names.split() if name in plain}
@@ -127,6 +136,8 @@ def opencv(tree: Fields, *, rectified: bool) -> Fields:
             fields = _projections(_shaped(found, "p1", 3, 4), _shaped(found, "p2", 3, 4))
         elif "q" in found:
             fields = _reprojection(_shaped(found, "q", 4, 4))
+        elif "m1" in found and alone:
+            fields = _alone(_shaped(found, "m1", 3, 3))
         elif {"m1", "m2"} <= found.keys():
             raise ValueError(
                 "holds the two cameras but not how they stand to each other (R and T, or P1 and P2):"
@@ -148,10 +159,12 @@ def opencv(tree: Fields, *, rectified: bool) -> Fields:
     return _raw(left, found.get("d1", ()), right, found.get("d2", ()), rotation, translation) | {"image_size": size}
 
 
-def ros(left: Fields, right: Fields | None, *, rectified: bool) -> Fields:
+def ros(left: Fields, right: Fields | None, *, rectified: bool, alone: bool = False) -> Fields:
     """ROS camera_info: one file a camera; the right one's projection holds minus focal length times baseline."""
     first, second = _camera_info(left), None if right is None else _camera_info(right)
     if second is None:
+        if first["p"][0, 3] == 0 and alone:
+            return _alone(first["p"]) | {"image_size": first["size"]}
         if first["p"][0, 3] == 0:
             raise ValueError("is the left camera's camera_info and holds no baseline: give both, load_rig(left, right)")
         if not rectified and (np.any(first["d"]) or not np.allclose(first["r"], np.eye(3), atol=1e-9)):
@@ -314,6 +327,18 @@ def _projections(left: np.ndarray, right: np.ndarray) -> Fields:
         "center_px": (float(left[0, 2]), float(left[1, 2])),
         "baseline_m": float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0]),
         "doffs_px": float(right[0, 2] - left[0, 2]),
+    }
+
+
+def _alone(camera: np.ndarray) -> Fields:
+    """A single camera from its matrix: it has no baseline, and no other center to be offset from."""
+    if not camera[0, 0] > 0:
+        raise ValueError(f"has the focal length {camera[0, 0]:g} px: it was never calibrated")
+    return {
+        "focal_px": (float(camera[0, 0]), float(camera[1, 1])),
+        "center_px": (float(camera[0, 2]), float(camera[1, 2])),
+        "baseline_m": None,
+        "doffs_px": 0.0,
     }
 
 

@@ -23,7 +23,7 @@ def written(fields: Fields, suffix: str) -> str:
         ValueError: No format that is known here has this suffix, or it cannot hold this rig.
     """
     check_suffix(suffix, rectified="rotation" not in fields)
-    if suffix != ".json" and not fields["metric"]:
+    if WRITERS[suffix] is not _own and not fields["metric"]:
         raise ValueError(f"path must end in .json for a rig in arbitrary units, which {suffix} files cannot tell")
     return WRITERS[suffix](fields)
 
@@ -33,7 +33,7 @@ def check_suffix(suffix: str, name: str = "path", *, rectified: bool) -> None:
     able = [known for known in WRITERS if rectified or known not in RECTIFIED_ALONE]
     if suffix not in able:
         whose = "" if rectified else " for cameras that are not rectified"
-        raise ValueError(f"{name} must end in one of {', '.join(able)}{whose}, got {suffix or 'no suffix'}")
+        raise ValueError(f"{name} must end in one of {', '.join(filter(None, able))}{whose}, got {suffix}")
 
 
 def own_tree(fields: Fields) -> dict[str, Any]:
@@ -98,6 +98,7 @@ def _camera(focal: Any, center: Any) -> np.ndarray:
 
 WRITERS: dict[str, Callable[[Fields], str]] = {
     ".json": _own,
+    "": _own,
     ".yml": _storage(".yml"),
     ".yaml": _storage(".yaml"),
     ".xml": _storage(".xml"),

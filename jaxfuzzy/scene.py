@@ -121,13 +121,14 @@ def model_scene(
     Args:
         left: The left image: a path, or a uint8 array, grey (H, W) or BGR (H, W, 3) as `cv2.imread` gives it.
         right: The right image, of the same size. It may be None where disparities or depths are given.
-        rig: The cameras; of a depth camera only focal length and center matter, where `depth_std` is given.
+        rig: The cameras; of a depth camera only focal length and center matter (`load_rig(..., arbitrary_units=True)`).
         matcher: How to match.
         disparity_px: Disparities (H, W) of the left image from any other matcher, in pixels, not finite or not above 0 where
             unknown (see `read_disparity`); rectified images are then not matched, and of `matcher` the error of a disparity counts.
         depth_m: Depths (H, W) in metres along the optical axis of the left image instead, as a depth camera gives them (see
             `read_depth`).
-        depth_std: Their standard deviation, one number or one a pixel (H, W); None takes the rig's stereo error.
+        depth_std: Their standard deviation, one number or one a pixel (H, W); None takes the rig's stereo error, or what the
+            scene shows where the rig has no baseline.
         progress: Called with the name of each stage as it begins and the share of the work done, 0 to 1.
         **options: Those of `model_cloud`.
 
@@ -196,7 +197,7 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
         if name not in known:
             raise TypeError(f"unknown option {name!r}: allowed are {', '.join(known)}")
     rule, camera = options.get("rule", "robust"), options.get("camera", EYE)
-    checks.choice(rule, "rule", RULES)
+    checks.choice(rule, "rule", tuple(RULES))
     ground, up = options.get("ground", "auto"), options.get("up", "auto")
     if ground is not None:
         checks.choice(ground, "ground", ("auto",))
@@ -213,8 +214,9 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
     several: dict[str, Any] = {}
     if "kinds" in options:
         several["kinds"] = kinds_of(options["kinds"])
-    if options.get("ks", "auto") != "auto":
-        several["ks"] = candidates_of(options["ks"], division)
+    if "ks" in options:
+        numbers = candidates_of(options["ks"], division)
+        several["ks"] = options["ks"] if isinstance(options["ks"], str) else numbers
     return options | several
 
 

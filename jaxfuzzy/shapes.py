@@ -6,7 +6,7 @@ known: stereo errs along the ray alone, so a surface should predict one depth a 
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import jax
@@ -174,6 +174,9 @@ def kinds_of(kinds: Any) -> tuple[str, ...]:
     """The kinds to choose from."""
     if isinstance(kinds, str):
         raise TypeError(f"kinds must be several names, got the string {kinds!r}")
+    if not isinstance(kinds, Iterable):
+        raise TypeError(f"kinds must be several names, got {kinds!r}")
+    kinds = tuple(map(str, kinds))
     if not kinds:
         raise ValueError(f"kinds must name one of {', '.join(map(repr, KINDS))} at least, got none")
     return tuple(checks.choice(k, "kinds", KINDS) for k in kinds)

@@ -254,6 +254,14 @@ def test_points_that_their_precision_does_not_tell_apart(tmp_path):
         read_cloud(tmp_path / "far.npy")
 
 
+def test_empty_numpy_clouds(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((0, 6)))
+    np.savez(tmp_path / "b.npz", points=np.zeros((0, 3)), colors=np.zeros((0, 4), np.uint8))
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(ValueError, match="holds no finite point, out of 0"):
+            read_cloud(tmp_path / name)
+
+
 def test_a_column_that_is_no_whole_number_is_left_as_it_is(tmp_path):
     """Of one that is not asked for nothing hangs on that; a color beyond its range is the brightest, not what is left of 256."""
     head = PLY.format(2).replace(

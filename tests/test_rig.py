@@ -324,6 +324,24 @@ def test_a_camera_that_was_never_calibrated(tmp_path):
         load_rig(path, path)
 
 
+def test_a_single_camera_will_do_without_a_baseline(tmp_path):
+    """A depth camera's: its depths are metres by themselves."""
+    matrix = "[500, 0, 320, 0, 510, 240, 0, 0, 1]"
+    ros = "image_width: 640\nimage_height: 480\n"
+    for name, cols, data in (
+        ("camera_matrix", 3, matrix),
+        ("rectification_matrix", 3, "[1, 0, 0, 0, 1, 0, 0, 0, 1]"),
+        ("projection_matrix", 4, "[500, 0, 320, 0, 0, 510, 240, 0, 0, 0, 1, 0]"),
+    ):
+        ros += f"{name}:\n  rows: 3\n  cols: {cols}\n  data: {data}\n"
+    for text in (f"%YAML:1.0\ncamera_matrix: {matrix}\nimage_width: 640\nimage_height: 480\n", ros):
+        path = put(tmp_path, text)
+        rig = load_rig(path, arbitrary_units=True)
+        assert (rig.focal_px, rig.center_px, rig.image_size, rig.metric) == ((500, 510), (320, 240), (640, 480), False)
+        with pytest.raises(ValueError, match=r"baseline|how they stand|neither M1"):
+            load_rig(path)
+
+
 def test_lists_of_dashes(tmp_path):
     """As PyYAML writes nested lists."""
     block = lambda name, rows: (
@@ -375,7 +393,7 @@ def test_opencv_reads_what_is_written(tmp_path):
 
 
 def test_rigs_are_written_in_known_formats_alone(tmp_path):
-    for name in ("rig", "rig.pdf"):
+    for name in ("rig.pdf", "rig.json.bak"):
         with pytest.raises(ValueError, match=r"path must end in one of \.json, \.yml"):
             save_rig(tmp_path / name, RECTIFIED)
     with pytest.raises(ValueError, match="arbitrary units"):
@@ -383,6 +401,8 @@ def test_rigs_are_written_in_known_formats_alone(tmp_path):
     with pytest.raises(TypeError, match="rig must be a Rig, got NoneType"):
         save_rig(tmp_path / "rig.json", None)
     assert not list(tmp_path.iterdir())
+    save_rig(tmp_path / "rig", RECTIFIED)
+    assert load_rig(tmp_path / "rig") == RECTIFIED
 
 
 def test_a_remark_before_the_first_entry_does_no_harm(tmp_path):
@@ -454,7 +474,7 @@ def test_scaling_keeps_every_ray_and_depth():
     assert rig.scaled(0.5) == rig.scaled((320, 240))
     with pytest.raises(ValueError, match="factor"):
         dataclasses.replace(rig, image_size=None).scaled((320, 240))
-    with pytest.raises(ValueError, match="to must be finite and above 0"):
+    with pytest.raises(ValueError, match="to must be a finite number above 0"):
         rig.scaled(-1.0)
 
 

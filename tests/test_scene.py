@@ -1,5 +1,7 @@
 """The whole way: rendered scenes with exact truth, the paper's own figures, the bundled photograph, bad input."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from jaxfuzzy.rig import Rig
 from jaxfuzzy.scene import load_scene, model_cloud, model_scene
 from jaxfuzzy.seeding import histogram_seeds
 from jaxfuzzy.simulate import simulate_object
+from jaxfuzzy.status import Status
 from jaxfuzzy.stereo import example_pair, reconstruct
 from jaxfuzzy.validity import choose_k
 from jaxfuzzy.varieties import nfcv
@@ -145,6 +148,8 @@ def test_progress_is_told_in_order(paper_pair):
             r"noise_distance must have shape \(\) or \(200,\), got \(199,\)",
         ),
         ({"ks": 3}, TypeError, r"ks must be 'auto' or several numbers such as \(3,\), got 3"),
+        ({"kinds": 5}, TypeError, "kinds must be several names, got 5"),
+        ({"rule": ["robust"]}, ValueError, "rule must be one of"),
     ],
 )
 def test_wrong_options_are_named(options, error, word):
@@ -174,6 +179,8 @@ def test_options_may_be_any_iterables_and_are_saved(tmp_path):
     options = {"ground": None, "up": (0, 1, 0), "ks": range(1, 3), "kinds": iter(("cylinder", "box"))}
     scene = model_cloud(cloud, **options)
     assert [shape.kind for shape in scene.shapes] == ["cylinder"]
+    arrays = {"ks": np.array([1, 2]), "kinds": np.array(["cylinder", "box"])}
+    assert [shape.kind for shape in model_cloud(cloud, **options | arrays).shapes] == ["cylinder"]
     scene.save(tmp_path / "out")
     settings = load_scene(tmp_path / "out").settings
     assert (settings["ks"], settings["kinds"]) == ([1, 2], ["cylinder", "box"])
@@ -230,6 +237,11 @@ def test_depths_of_a_depth_camera_take_the_place_of_matching(paper_pair, tmp_pat
     again = load_scene(tmp_path / "out")
     np.testing.assert_array_equal(again.image, scene.image)
     assert again.image_right is None
+    # Of a depth camera no baseline is known, and depths are metres all the same.
+    alone = dataclasses.replace(paper_pair.rig, baseline_m=1.0, metric=False)
+    scene = model_scene(paper_pair.left, None, alone, depth_m=depth)
+    assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
+    assert not int(scene.status) & Status.ARBITRARY_UNITS
     for wrong, says in (
         ({"depth_m": depth, "disparity_px": depth}, "must not both be given"),
         ({"depth_std": 0.001}, "depth_std must come with depth_m"),
@@ -239,6 +251,20 @@ def test_depths_of_a_depth_camera_take_the_place_of_matching(paper_pair, tmp_pat
             model_scene(paper_pair.left, None, paper_pair.rig, **wrong)
     with pytest.raises(TypeError, match="right must be an image or a path, got None"):
         model_scene(paper_pair.left, None, paper_pair.rig)
+
+
+def test_a_part_of_a_scene_may_be_small_beside_its_distance():
+    """Touching balls a kilometre from the origin: the whole is told apart well enough, and so are its parts."""
+    rng = np.random.default_rng(1)
+    parts = [np.column_stack([rng.uniform(0, 5, (4000, 2)), np.zeros(4000)])]
+    for x, y in ((1.0, 1.0), (4.0, 1.5), (2.5, 4.0)):
+        for along in (0, 0.285):
+            direction = rng.normal(size=(400, 3))
+            parts.append(0.15 * direction / np.linalg.norm(direction, axis=1)[:, None] + [x + along, y, 0.15])
+    points = np.concatenate(parts)
+    points = (points + 0.001 * rng.normal(size=points.shape) + [1000, 0, 0]).astype(np.float32)
+    scene = model_cloud(Cloud(points), up=(0, 0, 1), camera=None)
+    assert [shape.kind for shape in scene.shapes] == ["sphere"] * 6
 
 
 def test_arguments_of_another_kind_are_named(paper_pair):
@@ -256,6 +282,8 @@ def test_arguments_of_another_kind_are_named(paper_pair):
         ({"pixels_px": np.full((200, 2), np.nan)}, "cloud.pixels_px must be finite"),
         ({"colors": np.zeros((5, 3))}, r"cloud.colors must have shape \(200, 3\)"),
         ({"colors": np.full((200, 3), 255.0)}, "cloud.colors must be 0 to 1"),
+        ({"depth_std": np.ones(5)}, "cloud.depth_std must have shape"),
+        ({"depth_std": -np.ones(200)}, "cloud.depth_std must be finite and above 0"),
     ):
         with pytest.raises(ValueError, match=says):
             model_cloud(Cloud(points, **fields))

@@ -815,6 +815,8 @@ def test_depth_maps(tmp_path):
     cv2.imwrite(str(tmp_path / "depth.png"), np.array([[0, 1500], [250, 4000]], np.uint16))
     expected = np.array([[np.nan, 1.5], [0.25, 4.0]], np.float32)
     np.testing.assert_array_equal(read_depth(tmp_path / "depth.png", scale=1000), expected)
+    with pytest.raises(ValueError, match=r"holds uint16.*give scale=1000"):
+        read_depth(tmp_path / "depth.png")
     np.save(tmp_path / "depth.npy", np.full((2, 3), 1500, np.int16))
     np.testing.assert_array_equal(read_depth(tmp_path / "depth.npy", scale=1000), np.full((2, 3), 1.5))
     with pytest.raises(FileNotFoundError, match="depth not found"):
