@@ -35,7 +35,7 @@ from jaxfuzzy.primitives import primitive_from_dict
 from jaxfuzzy.rig import load_rig, save_rig
 from jaxfuzzy.segment import Segmentation
 from jaxfuzzy.shapes import Shape
-from jaxfuzzy.status import SENTENCES
+from jaxfuzzy.status import SENTENCES, Status
 
 if TYPE_CHECKING:
     from jaxfuzzy.scene import Scene
@@ -78,7 +78,7 @@ def to_dict(scene: "Scene") -> dict[str, Any]:
         {
             "schema": SCHEMA,
             "version": VERSION,
-            "units": {"length": "m" if scene.rig is None or scene.rig.metric else "arbitrary", "angle": "rad"},
+            "units": {"length": "arbitrary" if int(scene.status) & Status.ARBITRARY_UNITS else "m", "angle": "rad"},
             "frame": "as in the cloud given" if scene.rig is None else "left camera: x right, y down, z forward",
             "made_with": _versions(),
             "settings": scene.settings,

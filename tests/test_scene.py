@@ -241,7 +241,11 @@ def test_depths_of_a_depth_camera_take_the_place_of_matching(paper_pair, tmp_pat
     alone = dataclasses.replace(paper_pair.rig, baseline_m=1.0, metric=False)
     scene = model_scene(paper_pair.left, None, alone, depth_m=depth)
     assert [shape.kind for shape in scene.shapes] == ["cylinder", "box"]
-    assert not int(scene.status) & Status.ARBITRARY_UNITS
+    assert scene.to_dict()["units"]["length"] == "m"
+    disparity = np.where(paper_pair.visible, paper_pair.disparity_px, np.nan)
+    unknown = model_scene(paper_pair.left, None, alone, disparity_px=disparity)
+    assert unknown.to_dict()["units"]["length"] == "arbitrary"
+    assert int(unknown.status) & Status.ARBITRARY_UNITS
     for wrong, says in (
         ({"depth_m": depth, "disparity_px": depth}, "must not both be given"),
         ({"depth_std": 0.001}, "depth_std must come with depth_m"),
