@@ -37,8 +37,11 @@ def points(value: Any, name: str = "points", *, dims: int | None = None) -> Arra
     return _finite(as_float(array), name)
 
 
-def places(value: Any, name: str = "points") -> Array:
-    """Points (N, 3) of a scene, in lengths whose squares and fourth powers single precision can hold."""
+def places(value: Any, name: str = "points", *, whole: bool = False) -> Array:
+    """Points (N, 3) of a scene, in lengths whose squares and fourth powers single precision can hold.
+
+    Of a `whole` scene it is asked too whether their own precision tells them apart; a part may be small beside its distance.
+    """
     array = points(value, name, dims=3)
     if is_concrete(array):
         known = np.asarray(array)
@@ -48,21 +51,14 @@ def places(value: Any, name: str = "points") -> Array:
                 f"{name} must lie within {FARTHEST:g} of the origin and extend over at least {SMALLEST:g}, got {largest:g} and"
                 f" {extent:g}: give them in another unit"
             )
+        spacing = largest * float(np.finfo(known.dtype).eps)
+        if whole and spacing > COARSEST * extent > 0:
+            raise ValueError(
+                f"{name} lie up to {largest:g} from the origin and extend over {extent:g}, and {known.dtype} tells them apart by"
+                f" {spacing:.2g}, which is too little: subtract an offset from them, or compute in double precision"
+                " (JAX_ENABLE_X64=1)"
+            )
     return array
-
-
-def scene_points(value: Any, name: str = "points") -> np.ndarray:
-    """Points (N, 3) of a whole scene, on the host, that their precision tells apart. Of a part of a scene that is not asked."""
-    known = np.asarray(places(value, name))
-    largest, extent = float(np.abs(known).max()), float(extents(known).max())
-    spacing = largest * float(np.finfo(known.dtype).eps)
-    if spacing > COARSEST * extent > 0:
-        raise ValueError(
-            f"{name} lie up to {largest:g} from the origin and extend over {extent:g}, and {known.dtype} tells them apart by"
-            f" {spacing:.2g}, which is too little: subtract an offset from them, or compute in double precision"
-            " (JAX_ENABLE_X64=1)"
-        )
-    return known
 
 
 def weights(value: Any, count: int, name: str = "weights") -> Array | None:

@@ -48,15 +48,15 @@ def check_cloud(cloud: Any) -> np.ndarray:
         ValueError: A field has another shape, or holds what cannot be.
     """
     checks.kind(cloud, "cloud", Cloud, "Cloud(points) makes one, read_cloud reads one")
-    points = checks.scene_points(cloud.points, "cloud.points")
+    points = np.asarray(checks.places(cloud.points, "cloud.points", whole=True))
     for name, width in (("colors", 3), ("pixels_px", 2)):
         if (value := getattr(cloud, name)) is None:
             continue
         array = np.asarray(checks.points(value, f"cloud.{name}", dims=width))
         if len(array) != len(points):
             raise ValueError(f"cloud.{name} must have shape ({len(points)}, {width}), got {array.shape}")
-        if name == "colors" and not np.all((array >= -COLOR_SLACK) & (array <= 1 + COLOR_SLACK)):
-            raise ValueError(f"cloud.colors must be 0 to 1, got {array.min():g} to {array.max():g}")
+        if name == "colors":
+            _check_colors(array)
         if name == "pixels_px" and len(array) > 1 and not extents(array).any():
             raise ValueError(
                 f"cloud.pixels_px must be the column and row of each point, got {array[0].tolist()} for all"
@@ -64,6 +64,11 @@ def check_cloud(cloud: Any) -> np.ndarray:
     if cloud.depth_std is not None:
         checks.noise_distance(cloud.depth_std, len(points), "cloud.depth_std")
     return points
+
+
+def _check_colors(colors: np.ndarray) -> None:
+    if not np.all((colors >= -COLOR_SLACK) & (colors <= 1 + COLOR_SLACK)):
+        raise ValueError(f"cloud.colors must be 0 to 1, got {colors.min():g} to {colors.max():g}")
 
 
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
@@ -94,7 +99,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         finite = np.isfinite(np.stack([*points.T, *beside.values()])).all(axis=0)
         if not finite.any():
             raise ValueError(f"holds no finite point, out of {len(points)}")
-        checks.scene_points(points[finite])
+        checks.places(points[finite], whole=True)
     except ValueError as error:
         raise ValueError(f"cloud {os.fspath(path)} {one_line(error)}") from None
     if not finite.all():
@@ -151,8 +156,7 @@ def write_cloud(
     columns: cloudfiles.Columns = dict(zip("xyz", points.T, strict=True))
     if cloud.colors is not None:
         colors = np.asarray(cloud.colors)
-        if not np.all((colors >= -COLOR_SLACK) & (colors <= 1 + COLOR_SLACK)):
-            raise ValueError(f"cloud.colors must be 0 to 1, got {colors.min():g} to {colors.max():g}")
+        _check_colors(colors)
         arrays["colors"] = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
         columns |= dict(zip(COLORS[0], arrays["colors"].T, strict=True))
     if cloud.depth_std is not None:

@@ -136,7 +136,7 @@ def opencv(tree: Fields, *, rectified: bool, alone: bool = False) -> Fields:
             fields = _projections(_shaped(found, "p1", 3, 4), _shaped(found, "p2", 3, 4))
         elif "q" in found:
             fields = _reprojection(_shaped(found, "q", 4, 4))
-        elif "m1" in found and alone:
+        elif alone and "m1" in found and "m2" not in found:
             fields = _alone(_shaped(found, "m1", 3, 3))
         elif {"m1", "m2"} <= found.keys():
             raise ValueError(

@@ -342,6 +342,14 @@ def test_a_single_camera_will_do_without_a_baseline(tmp_path):
             load_rig(path)
 
 
+def test_two_cameras_are_no_single_one(tmp_path):
+    """Without how they stand to each other their pictures cannot be matched, in whatever units."""
+    matrix = "[500, 0, 320, 0, 510, 240, 0, 0, 1]"
+    path = put(tmp_path, f"M1: {matrix}\nM2: {matrix}\n")
+    with pytest.raises(ValueError, match="not how they stand to each other"):
+        load_rig(path, arbitrary_units=True)
+
+
 def test_lists_of_dashes(tmp_path):
     """As PyYAML writes nested lists."""
     block = lambda name, rows: (
